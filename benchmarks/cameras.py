@@ -67,7 +67,7 @@ class Start(NamedTuple):
     """[nq]"""
     qvel: np.ndarray
     """[nv]"""
-    command: dict[str, float]
+    goal: dict[str, float]
 
 
 class Played(NamedTuple):
@@ -169,7 +169,7 @@ def play(name: str, settings: Settings, start: Start, seed: int) -> Played:
         qvel_path.append(qvel.copy())
         num_steps = 0
     for _ in range(num_steps):
-        episode.control_step(start.command)
+        episode.control_step(start.goal)
         qpos[arm_qpos], qvel[arm_qvel] = episode.simulator.joint_state()
         qpos[ball_qpos], qvel[ball_qvel] = np.split(episode.balls[0, :6], 2)
         qpos_path.append(qpos.copy())
@@ -243,9 +243,9 @@ def main() -> None:
     reset = jax.jit(reset_episodes, static_argnums=(0, 2))
     states = reset(env, jax.random.key(args.seed), args.episodes)
     qpos, qvel = (np.array(x, float) for x in states.pipeline_state.physics[:2])
-    commands = jax.tree.map(np.asarray, states.pipeline_state.command)
+    goals = jax.tree.map(np.asarray, states.pipeline_state.goal)
     starts = [
-        Start(qpos[:, i], qvel[:, i], {name: float(x[..., i]) for name, x in commands.items()})
+        Start(qpos[:, i], qvel[:, i], {name: float(x[..., i]) for name, x in goals.items()})
         for i in range(args.episodes)
     ]
     settings = Settings(args.rate, args.ball, args.side_light, args.quick)

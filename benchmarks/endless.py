@@ -97,7 +97,7 @@ def measure(
     conditions at once, from the same resets."""
     env = Env(spanning_world(conditions))
     ranges = {}
-    for name in (*env.config.randomization.terms, *env.config.commands):
+    for name in (*env.config.randomization.terms, *env.config.goals):
         lows, highs = zip(*(condition.range(name) for condition in conditions), strict=True)
         ranges[name] = (
             jnp.asarray(np.stack(lows), jnp.float32),

@@ -90,8 +90,8 @@ def _throw_of(name: str) -> tuple[np.ndarray, np.ndarray]:
     """Positions and velocities of the balls [B, 3] at the start of an episode."""
     env = _model(name)[1]
     task = env.task(env)
-    command = {key: jnp.array(0.5 * (x.low + x.high)) for key, x in env.commands.items()}
-    thrown = task.throw(jnp.full(task.num_draws, 0.5), command)
+    goal = {key: jnp.array(0.5 * (x.low + x.high)) for key, x in env.goals.items()}
+    thrown = task.throw(jnp.full(task.num_draws, 0.5), goal)
     if thrown is not None:
         return tuple(np.asarray(x, float).reshape(-1, 3) for x in thrown)
     above = BALLS_APART * np.arange(env.num_balls)[:, None] * [0.0, 0.0, 1.0]
@@ -414,7 +414,10 @@ def faults(joints: int, policy: str = "robust") -> dict[str, Fault]:
         for size in (0.3, 1.0, -3.0):
             found[f"{name}: one sample off by {size} rad"] = Fault(_off(joint, size), steps=1)
         found[f"{name}: encoder jumps by 0.5 rad"] = Fault(_off(joint, 0.5), JUMP)
-        found[f"{name}: encoder drifts by 0.5 rad/s"] = Fault(_drift(joint, 0.5), (*ARM, "box"))
+        # Its velocities, of another sensor, may contradict it first.
+        found[f"{name}: encoder drifts by 0.5 rad/s"] = Fault(
+            _drift(joint, 0.5), (*ARM, *SPEED, "box")
+        )
         found[f"{name}: encoder is frozen"] = Fault(_frozen_encoder(joint), ARM, 0.5)
         found[f"{name}: servo without torque"] = Fault(_dead(joint), ARM, 0.5)
     for joint in (1, 2):
@@ -573,7 +576,7 @@ def run(name: str, fault: Fault, seed: int = 0) -> Outcome:
     home = paddle_position(metadata, robot.home)
     fault_at = FAULT_AT_OF.get(name, FAULT_AT)
     arm = policy.supervise(RATE, box=(home - BOX, home + BOX))
-    wished = {key: float(np.mean(command.range)) for key, command in metadata.commands.items()}
+    wished = {key: float(np.mean(goal.range)) for key, goal in metadata.goals.items()}
     last_commands: list[np.ndarray] = []
     """Of the control steps."""
     commanded: list[np.ndarray] = []

@@ -22,7 +22,7 @@ from bounce_mjx.evaluation.c_episodes import make_mujoco_evaluator
 from bounce_mjx.evaluation.config import DEFAULT_EPISODES, DEFAULT_SEED
 from bounce_mjx.evaluation.episodes import make_evaluator
 from bounce_mjx.evaluation.results import Report, judge
-from bounce_mjx.evaluation.suite import neutral_commands
+from bounce_mjx.evaluation.suite import neutral_goals
 from bounce_mjx.runs.checkpoints import read_actor
 from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.folders import choose_checkpoint
@@ -40,13 +40,13 @@ def measure(path: Path, seed: int, episodes: int, physics: str) -> Report:
     env = Env(config.env.model_copy(update={"randomization": randomization}))
     set_up_jax(env.config)
     _, policy, actor = read_actor(checkpoint, config)
-    commands = neutral_commands(env.config)
-    ranges = env.ranges() | commands
+    goals = neutral_goals(env.config)
+    ranges = env.ranges() | goals
     ranges = jax.tree.map(lambda end: jnp.asarray(end, jnp.float32)[None], ranges)
     make = make_mujoco_evaluator if physics == "mujoco" else make_evaluator
     evaluate = make(env, actor(env), episodes)
     statistics, recording = evaluate(policy, jax.random.PRNGKey(DEFAULT_SEED), ranges)
-    return judge(env, statistics, recording, commands)
+    return judge(env, statistics, recording, goals)
 
 
 def main() -> None:

@@ -27,7 +27,7 @@ from bounce_mjx.identify.world_file import to_yaml
 from bounce_mjx.physics import CEngine, edited_model
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.model import find_addresses, joint_names
-from bounce_mjx.runs.settings import read_preset
+from bounce_mjx.runs.layers import read_preset
 from bounce_mjx.training.setup import set_up_jax
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.model import model_nominals, world_model
@@ -39,7 +39,7 @@ _SPIKE = 0.5
 # Terms of the sensors, which are the same for all robots, and disturbances.
 _FIXED = (
     "camera_rate frame_drop ball_position_noise joint_velocity_noise push_speed push_interval "
-    "command_interval ball_start"
+    "goal_interval ball_start"
 ).split()
 _CAMERA_RATE = 120.0
 _LOST = 0.05

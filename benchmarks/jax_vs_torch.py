@@ -53,7 +53,7 @@ from bounce_mjx.interrupt import in_daemon_thread
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Actor, make_networks, untrained_policy
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.runs.settings import read_preset
+from bounce_mjx.runs.layers import read_preset
 from bounce_mjx.task.bounce import Config as EnvConfig
 from bounce_mjx.training.setup import compiler_options
 

@@ -35,7 +35,7 @@ def run(name: str) -> np.ndarray:
     metadata = policy.metadata
     home = np.array(metadata.default_joint_angles)
     paddle = paddle_position(metadata, home)
-    commands = {key: float(np.mean(command.range)) for key, command in metadata.commands.items()}
+    goals = {key: float(np.mean(goal.range)) for key, goal in metadata.goals.items()}
     times = []
     for step in range(STEPS):
         now = step * metadata.control_dt
@@ -45,7 +45,7 @@ def run(name: str) -> np.ndarray:
         angles = home + 1e-5 * np.sin(7.0 * now + np.arange(len(home)))
         ball = paddle + [0.0, 0.0, 0.05 + height]
         velocity = [0.0, 0.0, LAUNCH_SPEED - GRAVITY * flown]
-        measured = commands | {
+        measured = goals | {
             "joint_angles": angles,
             "joint_velocities": np.zeros(len(home)),
             "ball_position": np.tile(ball, metadata.num_balls),

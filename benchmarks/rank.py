@@ -29,13 +29,13 @@ from bounce_mjx.evaluation.config import (
     DEFAULT_SEED,
     EvaluationOptions,
     Physics,
-    command_ranges,
+    goal_ranges,
     on_engine,
 )
 from bounce_mjx.evaluation.episodes import begin, reset_episodes, run_until
 from bounce_mjx.evaluation.results import episodes_of
 from bounce_mjx.evaluation.robustness import ConditionOutcome, measure_conditions
-from bounce_mjx.evaluation.suite import load_suite, neutral_commands
+from bounce_mjx.evaluation.suite import load_suite, neutral_goals
 from bounce_mjx.learning.policy import Actor, Policy
 from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.checkpoints import read_actor
@@ -149,9 +149,9 @@ def measure_nominal(
 ) -> Figures:
     """The task's own figures in the nominal world, and the median of the hits of bouncing: in
     episodes without a time limit, else in episodes of the usual length."""
-    env = Env(trained.model_copy(update={"randomization": RandomizationConfig()}))
-    commands = neutral_commands(trained)
-    ranges = {name: (jnp.array([low]), jnp.array([high])) for name, (low, high) in commands.items()}
+    env = Env(trained.in_world(RandomizationConfig()))
+    goals = neutral_goals(trained)
+    ranges = {name: (jnp.array([low]), jnp.array([high])) for name, (low, high) in goals.items()}
     counts_hits = isinstance(env.task, Bounce)
     num_episodes = HIT_EPISODES if counts_hits else TIMED_EPISODES
     reset = jax.jit(lambda key: reset_episodes(env, key, num_episodes, ranges or None))
@@ -172,7 +172,7 @@ def measure_nominal(
     else:
         now = advance(policy, now, env.config.episode_steps)
         statistics = jax.device_get(now.statistics)
-    episodes = episodes_of(statistics, command_ranges(env.config) | commands)
+    episodes = episodes_of(statistics, goal_ranges(env.config) | goals)
     return figures | own_figures(env.task, episodes)
 
 

@@ -48,7 +48,7 @@ from bounce_mjx.identify.sentences import describe_doubts
 from bounce_mjx.identify.simulation import compensated, make_targets
 from bounce_mjx.physics import CEngine, edited_model
 from bounce_mjx.robot.model import find_addresses, joint_names
-from bounce_mjx.runs.settings import read_preset
+from bounce_mjx.runs.layers import read_preset
 from bounce_mjx.training.setup import set_up_jax
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.model import world_model

@@ -31,7 +31,7 @@ from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.runs.settings import read_preset
+from bounce_mjx.runs.layers import read_preset
 from bounce_mjx.training.ppo_trainer import PPOTrainer
 from bounce_mjx.training.setup import set_up_jax
 

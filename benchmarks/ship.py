@@ -30,7 +30,6 @@ from bounce_mjx.runs.checkpoints import (
     save_checkpoint,
 )
 from bounce_mjx.runs.config import CONFIG_FILE, ROBOT, TrainConfig, load_run_config, runs_folder
-from bounce_mjx.runs.files import MANIFEST_FILE, to_json, write_atomically
 from bounce_mjx.runs.folders import (
     CHECKPOINTS,
     Checkpoint,
@@ -39,8 +38,9 @@ from bounce_mjx.runs.folders import (
     find_checkpoint,
     write_config,
 )
+from bounce_mjx.runs.layers import read_preset
 from bounce_mjx.runs.progress import RESULTS_FILE, load_results
-from bounce_mjx.runs.settings import read_preset
+from bounce_mjx.runs.storage import MANIFEST_FILE, to_json, write_atomically
 from bounce_mjx.training.setup import set_up_jax
 
 

@@ -661,10 +661,10 @@ class Episode:
         measured = {"joint_angles": angles, "joint_velocities": velocities, "ball_age": age * dt}
         return measured | {f"ball_{name}": x for name, x in seen.items()}
 
-    def control_step(self, command: dict[str, np.ndarray]) -> None:
+    def control_step(self, goal: dict[str, np.ndarray]) -> None:
         """The policy acts on what it knows, and the physics runs until its next step."""
         controller = self.policy.controller
-        measured = self.policy.driver.check(self.measure() | command)
+        measured = self.policy.driver.check(self.measure() | goal)
         try:
             memory, measured, steps = controller.take(self._memory, measured)
         except ImpossibleMeasurement as error:
@@ -705,7 +705,7 @@ class Episode:
 def nominal_env(policy: str) -> Env:
     """The environment of a shipped policy, with nothing randomised."""
     config = load_run_config(choose_checkpoint(Path(policy), Path()).run).env
-    return Env(config.model_copy(update={"randomization": RandomizationConfig()}))
+    return Env(config.in_world(RandomizationConfig()))
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -758,10 +758,10 @@ def evaluate(
     statistics = empty_statistics(env, states)
     path = [qpos[:, 0].copy()]
     for step in range(env.config.episode_steps):
-        commands = jax.tree.map(np.asarray, states.pipeline_state.command)
+        goals = jax.tree.map(np.asarray, states.pipeline_state.goal)
         for i in np.flatnonzero(statistics.running):
             episode = played[i]
-            episode.control_step({key: value[..., i] for key, value in commands.items()})
+            episode.control_step({key: value[..., i] for key, value in goals.items()})
             qpos[arm_qpos, i], qvel[arm_qvel, i] = episode.simulator.joint_state()
             qpos[ball_qpos, i], qvel[ball_qvel, i] = np.split(episode.balls[:, :6], 2, axis=1)
         path.append(qpos[:, 0].copy())

@@ -32,7 +32,7 @@ from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import make_networks
 from bounce_mjx.learning.ppo import PPO, policy_of, population
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.runs.settings import read_preset
+from bounce_mjx.runs.layers import read_preset
 from bounce_mjx.training.setup import set_up_jax
 
 try:

@@ -44,7 +44,7 @@ _SECTIONS = (
         "Tasks",
         "All but `find_task` are names of `bounce_mjx.task`. "
         "[Write a task](tasks.md#write-a-task) shows their use.",
-        "task.task world.config.WorldConfig world.config.Command world.observation.Quantity "
+        "task.task world.config.WorldConfig world.config.Goal world.observation.Quantity "
         "world.limits task.results task.registry.find_task",
     ),
     (

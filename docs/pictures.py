@@ -198,7 +198,7 @@ def rollout(observation=None, randomization=None, seconds=3.0, target=0.5):
 
     def step(state, _):
         truth = env.kinematics(state.pipeline_state)
-        height = state.pipeline_state.command["target_height"]
+        height = state.pipeline_state.goal["target_height"]
         values = truth._asdict() | {"target_height": height[None]}
         state = env.step(state, networks.act(policy, layout.pack(values)))
         return state, (state.obs, env.kinematics(state.pipeline_state), state.metrics)
@@ -457,16 +457,14 @@ def simulators():
     config = load_run_config(resource_path(POLICIES["robust"])).env
     env = Env(config.model_copy(update={"randomization": type(config.randomization)()}))
     start = jax.jit(reset_episodes, static_argnums=(0, 2))(env, jax.random.key(seed), 1)
-    command = {name: float(x[..., 0]) for name, x in start.pipeline_state.command.items()}
+    goal = {name: float(x[..., 0]) for name, x in start.pipeline_state.goal.items()}
     names = {"bullet": "PyBullet", "physx": "SAPIEN", "mujoco": "MuJoCo"}
     panels = []
     for name, title in names.items():
         world = benchmark.WORLDS["60 + 30 ms"]
         _, path = benchmark.evaluate("robust", name, world, 1, seed)
         with Renderer(env, 280, 280, zoom=1.3) as renderer:
-            pictures = [
-                Image.fromarray(renderer.render(qpos, command)) for qpos in path[:steps:every]
-            ]
+            pictures = [Image.fromarray(renderer.render(qpos, goal)) for qpos in path[:steps:every]]
         for picture in pictures:
             ImageDraw.Draw(picture).text((10, 250), title, "white", ImageFont.load_default(20))
         panels.append(pictures)
@@ -486,7 +484,7 @@ PICTURES = (
 
 _LATE = "--randomization.action-latency 0.06 0.06 --randomization.ball-latency 0.03 0.03"
 FILMS = {
-    "bounce": "pretrained --size 832 468 --zoom 1.4 --randomization.command-interval 2 2",
+    "bounce": "pretrained --size 832 468 --zoom 1.4 --randomization.goal-interval 2 2",
     "track": "track --zoom 1.4",
     "balance": "balance --zoom 3",
     "catch": "catch --zoom 2 --seconds 4",

@@ -61,7 +61,7 @@ def main() -> None:
     policy = load_policy(arguments.policy)
     metadata = policy.metadata
     config = environment_config(policy=arguments.policy, world="training")
-    if arguments.target_height and "target_height" not in config.commands:
+    if arguments.target_height and "target_height" not in config.goals:
         raise UserError(f"{arguments.policy} has no target height; omit --target-height")
     model = camera = None
     if arguments.cameras:
@@ -73,7 +73,7 @@ def main() -> None:
     home = paddle_position(metadata, np.array(metadata.default_joint_angles))
     log = contextlib.nullcontext()
     if arguments.log:
-        units = {name: wanted.unit for name, wanted in metadata.commands.items()}
+        units = {name: wanted.unit for name, wanted in metadata.goals.items()}
         log = Recorder(arguments.log, metadata.joint_names, units, metadata.num_balls)
     with log as recorder:
         session = play(

@@ -18,13 +18,13 @@ class Inputs(NamedTuple):
     reach: jax.Array
     """Height over the paddle that the ball's energy allows [], m."""
     target: jax.Array
-    """Commanded height [], m."""
+    """Target height [], m."""
     distance: jax.Array
     """Horizontal distance of the ball from its start [], m."""
 
 
 class ApexReward(task.RewardTerm):
-    """Apex: the ball's energy is that of a bounce to the commanded height."""
+    """Apex: the ball's energy is that of a bounce to the target height."""
 
     weight: float = 4.0
     """Weight of the term."""
@@ -55,10 +55,10 @@ class Rewards(task.StrictModel):
 
 
 class Observation(task.ObservationConfig):
-    """The world's quantities, and the commanded apex."""
+    """The world's quantities, and the target apex."""
 
-    apex: Annotated[task.History, task.Quantity(1, "m", "command")] = 1
-    """Commanded height of the apexes above the paddle."""
+    apex: Annotated[task.History, task.Quantity(1, "m", "goal")] = 1
+    """Target height of the apexes above the paddle."""
 
 
 class Config(task.WorldConfig):
@@ -67,16 +67,16 @@ class Config(task.WorldConfig):
     ball_init_pos: tuple[float, float, float] = (0.58856, 0.0, 0.25)
     """Ball position at a reset, before noise, m."""
     apex_range: tuple[float, float] = (0.065, 0.085)
-    """Range of the commanded apex height above the paddle, m."""
+    """Range of the target apex height above the paddle, m."""
     observation: Observation = Observation()
     """The quantities that the policy sees."""
     reward: Rewards = Rewards()
     """The reward terms."""
 
     @property
-    def commands(self) -> dict[str, task.Command]:
+    def goals(self) -> dict[str, task.Goal]:
         low, high = self.apex_range
-        return {"apex": task.Command(low, high, "m", least=0.01, step=0.005)}
+        return {"apex": task.Goal(low, high, "m", least=0.01, step=0.005)}
 
 
 class Dribble(task.Task):
@@ -95,7 +95,7 @@ class Dribble(task.Task):
         height_over_paddle = ball_position[2] - step.truth.paddle_position[2]
         height = height_over_paddle - self.geometry.rest_height
         distance = task.horizontal_distance(ball_position, self.config.ball_init_pos)
-        target = step.command["apex"]
+        target = step.goal["apex"]
         # The height at which the ball's speed would be 0.
         reach = height + jnp.square(velocity_z) / (2.0 * task.GRAVITY)
         inputs = Inputs(reach=reach, target=target, distance=distance)

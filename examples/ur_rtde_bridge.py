@@ -1,10 +1,13 @@
 """A policy on a Universal Robots arm, by ur_rtde (`pip install ur_rtde`), at 500 Hz.
 
 `python examples/ur_rtde_bridge.py ROBOT_IP POLICY --box 0.2 -0.5 -0.2 1.0 0.5 0.6` reads the ball
-from UDP datagrams "x y z age" (m in the frame of the base, s) on port 5005 of this computer; for a
-camera on another one, give the address at which this one is reached (`--listen`). Each episode
-starts when Enter is pressed, with the hands away from the arm. Read "Safety steps" in
-docs/real-robot.md first.
+from UDP datagrams "x y z age" (m in the controller's feature Base, s) on port 5005 of this
+computer; for a camera on another one, give the address at which this one is reached (`--listen`).
+Each episode starts when Enter is pressed, with the hands away from the arm.
+
+Set the tool centre point on the pendant to the paddle's centre, with its z along the paddle's upper
+normal: nothing is sent to an arm whose controller has the paddle elsewhere than the policy, such as
+a UR3e under the policy of a UR5e. Read "Safety steps" in docs/real-robot.md first.
 """
 
 import argparse
@@ -16,6 +19,7 @@ from collections.abc import Callable
 import numpy as np
 
 from bounce_mjx import load_policy
+from bounce_mjx.deploy.box import add_box, box_of
 
 RATE = 500.0
 """Commands a second, Hz."""
@@ -89,7 +93,7 @@ def bounce(
     rtde_c,
     rtde_r,
     camera,
-    task_commands: dict,
+    goals: dict,
     seconds: float,
     box: dict,
     is_told: Callable[[], bool] = has_pressed_enter,
@@ -101,7 +105,7 @@ def bounce(
       rtde_c: ur_rtde's `RTDEControlInterface`.
       rtde_r: its `RTDEReceiveInterface`.
       camera: its `measure` returns the ball's part of the measurements.
-      task_commands: such as the target height, m.
+      goals: such as the target height, m.
       box: the `box` of `DeployedPolicy.supervise`, m; empty for none.
       is_told: whether the operator has given the word to start since it was last asked.
 
@@ -123,8 +127,9 @@ def bounce(
                 "joint_angles": rtde_r.getActualQ(),
                 "joint_velocities": rtde_r.getActualQd(),
                 "time": rtde_r.getTimestamp(),
+                **tool_of(rtde_r.getActualTCPPose()),
                 **ball,
-                **task_commands,
+                **goals,
             }
             commands = arm.commands(measurements)
             for joint_angles in commands:
@@ -154,32 +159,28 @@ def bounce(
     return reasons
 
 
+def tool_of(pose: list[float]) -> dict[str, np.ndarray]:
+    """The paddle by the controller's kinematics, as two measurements.
+
+    Args:
+      pose: of the tool centre point, m, with its rotation vector, rad [6].
+    """
+    position, rotation = np.split(np.array(pose), 2)
+    angle = np.linalg.norm(rotation)
+    axis = rotation / max(angle, 1e-9)
+    # Rodrigues' formula for the tool's z.
+    upward = np.array([0.0, 0.0, 1.0])
+    turned = np.cos(angle) * upward + np.sin(angle) * np.cross(axis, upward)
+    normal = turned + (1.0 - np.cos(angle)) * axis[2] * axis
+    return {"tool_position": position, "tool_normal": normal}
+
+
 def servo(rtde_c, joint_angles: np.ndarray) -> None:
     """Sends a command [6], rad, for the next period."""
     # servoJ has these two arguments, and does not use them.
     velocity = 0.0
     acceleration = 0.0
     rtde_c.servoJ(joint_angles.tolist(), velocity, acceleration, 1.0 / RATE, LOOKAHEAD_TIME, GAIN)
-
-
-def add_box(parser: argparse.ArgumentParser) -> None:
-    """Adds the flags of the box, of which one has to be given."""
-    box = parser.add_mutually_exclusive_group(required=True)
-    box.add_argument(
-        "--box",
-        type=float,
-        nargs=6,
-        metavar=("X", "Y", "Z", "X2", "Y2", "Z2"),
-        help="the lowest and the highest x, y and z that the paddle may reach, m",
-    )
-    box.add_argument("--no-box", action="store_true", help="let the paddle go anywhere")
-
-
-def box_of(arguments: argparse.Namespace) -> dict:
-    """The setting of `DeployedPolicy.supervise` for the flags of `add_box`."""
-    if arguments.no_box:
-        return {}
-    return {"box": (arguments.box[:3], arguments.box[3:])}
 
 
 def main() -> None:
@@ -200,11 +201,9 @@ def main() -> None:
     rtde_r = RTDEReceiveInterface(arguments.robot, RATE)
     policy = load_policy(arguments.policy, joint_names=JOINTS)
     camera = Camera(address=arguments.listen)
-    task_commands = {"target_height": arguments.target_height}
+    goals = {"target_height": arguments.target_height}
     print("press Enter for each episode, when the ball is over the paddle and no hand is near")
-    reasons = bounce(
-        policy, rtde_c, rtde_r, camera, task_commands, arguments.seconds, box_of(arguments)
-    )
+    reasons = bounce(policy, rtde_c, rtde_r, camera, goals, arguments.seconds, box_of(arguments))
     for reason in reasons:
         print(reason)
     print(f"{camera.ignored} datagrams were ignored")

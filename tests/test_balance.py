@@ -27,12 +27,12 @@ def paths(start: jax.Array, speed: jax.Array, draws: jax.Array, steps: int) -> n
     def path(start: jax.Array, speed: jax.Array, draws: jax.Array) -> jax.Array:
         centre = balance.reset(task.Start(None, {}, draws))
 
-        def move(command: dict, _: None) -> tuple[dict, jax.Array]:
-            command = balance.next_command(centre, command)
-            return command, jnp.stack([command["point_x"], command["point_y"]])
+        def move(goal: dict, _: None) -> tuple[dict, jax.Array]:
+            goal = balance.next_goal(centre, goal)
+            return goal, jnp.stack([goal["point_x"], goal["point_y"]])
 
-        command = {"point_x": start[0], "point_y": start[1], "point_speed": speed}
-        return jax.lax.scan(move, command, length=steps)[1]
+        goal = {"point_x": start[0], "point_y": start[1], "point_speed": speed}
+        return jax.lax.scan(move, goal, length=steps)[1]
 
     batched = jax.vmap(path, in_axes=-1, out_axes=-1)
     return np.asarray(jax.jit(batched)(start, speed, draws))

@@ -186,7 +186,7 @@ class Two(Rest):
     num_balls = (2, 3)
     num_draws = 1
 
-    def throw(self, draws: jax.Array, command: task.Values) -> tuple[jax.Array, jax.Array]:
+    def throw(self, draws: jax.Array, goal: task.Values) -> tuple[jax.Array, jax.Array]:
         side = jnp.array([[0.0, -0.5, 0.5 + draws[0]], [0.0, 0.5, 0.5]])
         return side, jnp.array([[0.1, 0.0, 1.0], [-0.1, 0.0, 2.0]])
 

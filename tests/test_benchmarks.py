@@ -19,7 +19,7 @@ from bounce_mjx.evaluation.robustness import ConditionOutcome
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.resources import POLICIES, resource_path
 from bounce_mjx.runs.config import load_run_config
-from bounce_mjx.runs.settings import read_preset
+from bounce_mjx.runs.layers import read_preset
 
 
 def script(name: str):
@@ -190,9 +190,9 @@ def test_one_world_spans_all_conditions_without_an_end(endless) -> None:
     suite = Path(endless.__file__).with_name("endless.yaml")
     nominal, *conditions = endless.load_suite(suite, config)
     world = endless.spanning_world([nominal, *conditions])
-    assert nominal.ranges.keys() == config.commands.keys()
+    assert nominal.ranges.keys() == config.goals.keys()
     for condition in conditions:
-        for name in condition.ranges.keys() - config.commands.keys():
+        for name in condition.ranges.keys() - config.goals.keys():
             low, high = getattr(world.randomization, name)
             for end in (*condition.range(name), *nominal.range(name)):
                 assert np.all(low <= end) and np.all(end <= high), (condition, name)

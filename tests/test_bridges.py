@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from bounce_mjx import load_policy
+from bounce_mjx.deploy.box import add_box, box_of
 from bounce_mjx.resources import resource_path
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
@@ -58,6 +59,15 @@ class World:
             self.bounces += bool(falling and self.ball.qvel[2] > 0.0)
         self.ticks += 1
 
+    def tool(self) -> tuple[np.ndarray, np.ndarray]:
+        """The paddle's centre [3], m, and its axes [3, 3] in columns, z upward, by MuJoCo."""
+        mujoco.mj_kinematics(self.model, self.data)
+        paddle = self.data.geom("blocker")
+        axes = paddle.xmat.reshape(3, 3)
+        if axes[2, 2] < 0.0:
+            axes = axes * [1.0, -1.0, -1.0]
+        return paddle.xpos.copy(), axes
+
     def watch(self, arm: Any) -> None:
         self.held = arm.state not in ("running", "braking")
 
@@ -68,6 +78,15 @@ def check(world: World, reasons: list[str]) -> None:
     assert world.before >= 3 and world.bounces - world.before >= 2
     steps = np.abs(np.diff(world.commands, axis=0))
     assert steps.max() < 0.05
+
+
+def rotation_vector(axes: np.ndarray) -> np.ndarray:
+    """Of a rotation matrix [3, 3]."""
+    quaternion = np.zeros(4)
+    mujoco.mju_mat2Quat(quaternion, axes.ravel())
+    vector = np.zeros(3)
+    mujoco.mju_quat2Vel(vector, quaternion, 1.0)
+    return vector
 
 
 def knocked(world: World) -> None:
@@ -133,6 +152,10 @@ def test_ur_rtde_bridge() -> None:
 
         def getTimestamp(self) -> float:
             return world.time
+
+        def getActualTCPPose(self) -> list[float]:
+            position, axes = world.tool()
+            return [*position, *rotation_vector(axes)]
 
     class Socket:
         """Datagrams of the camera."""
@@ -205,6 +228,7 @@ def test_a_bridge_does_not_begin_at_readings_that_its_controller_contradicts() -
         getActualQ=lambda: (parked * [1, -1, 1, 1, 1, 1]).tolist(),
         getActualQd=lambda: [0.0] * 6,
         getTimestamp=lambda: 0.002 * len(ticks),
+        getActualTCPPose=lambda: [0.0] * 6,
     )
     camera = message(measure=lambda control_dt: {"ball_age": np.inf})
     reasons = bridge["bounce"](policy, control, receive, camera, {}, 6.0, {}, lambda: True)
@@ -212,24 +236,80 @@ def test_a_bridge_does_not_begin_at_readings_that_its_controller_contradicts() -
     assert "Joint2 is 2 rad from where its commands rest" in reasons[0]
 
 
-def test_a_bridge_asks_for_a_box(capsys: pytest.CaptureFixture) -> None:
+# Of Universal Robots' own table (support article "DH parameters"): d and a of each joint, m.
+UNIVERSAL_ROBOTS = {
+    "UR3e": ((0.15185, 0, 0, 0.13105, 0.08535, 0.0921), (0, -0.24355, -0.2132, 0, 0, 0)),
+    "UR5e": ((0.1625, 0, 0, 0.1333, 0.0997, 0.0996), (0, -0.425, -0.3922, 0, 0, 0)),
+    "UR10e": ((0.1807, 0, 0, 0.17415, 0.11985, 0.11655), (0, -0.6127, -0.57155, 0, 0, 0)),
+}
+TWISTS = (np.pi / 2, 0.0, 0.0, np.pi / 2, -np.pi / 2, 0.0)
+"""alpha of each joint, rad."""
+PADDLE = 0.0304
+"""From the flange to the paddle's centre along the flange's z, m."""
+
+
+def tool_pose(robot: str, angles: Any) -> list[float]:
+    """What the controller of a Universal Robot gives as its tool centre point's pose."""
+    pose = np.eye(4)
+    for q, d, a, twist in zip(angles, *UNIVERSAL_ROBOTS[robot], TWISTS, strict=True):
+        c, s = np.cos(q), np.sin(q)
+        ca, sa = np.cos(twist), np.sin(twist)
+        link = [[c, -s * ca, s * sa, a * c], [s, c * ca, -c * sa, a * s], [0, sa, ca, d]]
+        pose = pose @ np.array([*link, [0, 0, 0, 1]])
+    return [*(pose[:3, 3] + PADDLE * pose[:3, 2]), *rotation_vector(pose[:3, :3])]
+
+
+@pytest.mark.parametrize("robot", list(UNIVERSAL_ROBOTS))
+@pytest.mark.parametrize("parked", [0.0, 0.4])
+def test_a_ur_bridge_sends_nothing_to_another_robot(robot, parked) -> None:
+    """Of which the joints have the same names, and rest at the same angles."""
     bridge = runpy.run_path(str(EXAMPLES / "ur_rtde_bridge.py"))
+    policy = load_policy("ur5e", joint_names=bridge["JOINTS"])
+    arm = message(angles=np.array(policy.metadata.default_joint_angles) + parked)
+    sent, ticks = [], []
+
+    def follow(angles: list[float], *settings: float) -> None:
+        sent.append(angles)
+        arm.angles = np.array(angles)
+
+    control = message(
+        initPeriod=lambda: None, waitPeriod=ticks.append, servoJ=follow, servoStop=lambda: None
+    )
+    start = arm.angles
+    receive = message(
+        getTargetQ=lambda: arm.angles.tolist(),
+        getActualQ=lambda: (arm.angles + 1e-4).tolist(),
+        getActualQd=lambda: [0.0] * 6,
+        getTimestamp=lambda: 0.002 * len(ticks),
+        getActualTCPPose=lambda: tool_pose(robot, arm.angles),
+    )
+    camera = message(measure=lambda control_dt: {"ball_age": np.inf})
+    reasons = bridge["bounce"](policy, control, receive, camera, {}, 6.0, {}, lambda: False)
+    if robot == "UR5e":
+        assert not reasons and sent
+        np.testing.assert_allclose(sent[0], start, atol=1e-3)
+    else:
+        assert not sent
+        assert len(reasons) == 1 and "check that the policy is of this arm" in reasons[0]
+
+
+def test_a_robots_program_asks_for_a_box(capsys: pytest.CaptureFixture) -> None:
     parser = argparse.ArgumentParser()
-    bridge["add_box"](parser)
+    add_box(parser)
     with pytest.raises(SystemExit):
         parser.parse_args([])
     assert "--box --no-box is required" in capsys.readouterr().err
     given = "--box 0.2 -0.5 -0.2 1 0.5 0.6".split()
-    assert bridge["box_of"](parser.parse_args(given)) == {"box": ([0.2, -0.5, -0.2], [1, 0.5, 0.6])}
-    assert bridge["box_of"](parser.parse_args(["--no-box"])) == {}
+    assert box_of(parser.parse_args(given)) == {"box": ([0.2, -0.5, -0.2], [1, 0.5, 0.6])}
+    assert box_of(parser.parse_args(["--no-box"])) == {}
 
 
 def message(**fields: Any) -> types.SimpleNamespace:
     return types.SimpleNamespace(**fields)
 
 
-def test_ros2_bridge(monkeypatch: pytest.MonkeyPatch) -> None:
-    world, said = World(), []
+def ros_bridge(monkeypatch: pytest.MonkeyPatch, world: World, said: list[str]) -> dict[str, Any]:
+    """The names of the ROS bridge, on stand-ins of the messages and of a node."""
 
     class Time:
         def __init__(self, nanoseconds: int):
@@ -266,9 +346,9 @@ def test_ros2_bridge(monkeypatch: pytest.MonkeyPatch) -> None:
         "rclpy": {},
         "rclpy.node": {"Node": Node},
         "rclpy.time": {"Time": Time},
-        "geometry_msgs.msg": {"PointStamped": None},
+        "geometry_msgs.msg": {"PointStamped": None, "PoseStamped": None},
         "sensor_msgs.msg": {"JointState": None},
-        "std_msgs.msg": {"Empty": None, "Float64MultiArray": message},
+        "std_msgs.msg": {"Empty": None, "Float64MultiArray": message, "Header": None},
     }
     for name, content in modules.items():
         module = types.ModuleType(name)
@@ -277,18 +357,31 @@ def test_ros2_bridge(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setitem(
             sys.modules, name.split(".")[0], sys.modules.get(name.split(".")[0], module)
         )
-    bridge = runpy.run_path(str(EXAMPLES / "ros2_bridge.py"))
+    return runpy.run_path(str(EXAMPLES / "ros2_bridge.py"))
+
+
+def test_ros2_bridge(monkeypatch: pytest.MonkeyPatch) -> None:
+    world, said = World(), []
+    bridge = ros_bridge(monkeypatch, world, said)
     rests_at = world.data.ctrl[:6].tolist()
-    node = bridge["Bridge"](load_policy("robust"), rests_at, {"box": BOX}, 0.5)
-    # The operator says where the arm rests, and where the paddle may go.
-    for words in (["robust", "--no-box"], ["robust", "--rests-at", "0", "0"]):
+    tool_topic = "/tcp_pose_broadcaster/pose"
+    node = bridge["Bridge"](load_policy("robust"), rests_at, {"box": BOX}, "base", tool_topic, 0.5)
+    # The operator says where the arm rests, where the paddle may go, and the frame's name.
+    rests, box, frame = ["--rests-at", "0", "0"], ["--no-box"], ["--frame", "base"]
+    for words in (rests + box, rests + frame, box + frame):
         with pytest.raises(SystemExit):
-            bridge["parse_arguments"](words)
+            bridge["parse_arguments"](["robust", *words])
+    assert bridge["parse_arguments"](["robust", *rests, *box, *frame]).frame == "base"
     ((period, tick),) = node.timers
     assert period == 1.0 / RATE
     backwards = world.names[::-1]
     shown = None
-    for _ in range(round(SECONDS * RATE)):
+    for count in range(round(SECONDS * RATE)):
+        if count == 10:
+            # Nothing is sent before the tool's pose has come.
+            assert not hasattr(node, "sent")
+        if count >= 10:
+            node.subscribed[tool_topic](tool_message(world))
         state = message(
             name=backwards,
             position=world.data.qpos[:6][::-1].tolist(),
@@ -302,7 +395,8 @@ def test_ros2_bridge(monkeypatch: pytest.MonkeyPatch) -> None:
             shown = picture[0]
             point = message(**dict(zip("xyz", picture[1], strict=True)))
             stamp = message(sec=int(shown), nanosec=round(shown % 1 * 1e9))
-            node.subscribed["/ball"](message(point=point, header=message(stamp=stamp)))
+            header = message(stamp=stamp, frame_id="base")
+            node.subscribed["/ball"](message(point=point, header=header))
         if node.arm.state in ("ready", "stopped"):
             node.subscribed["/start"](message())
         tick()
@@ -317,3 +411,50 @@ def test_ros2_bridge(monkeypatch: pytest.MonkeyPatch) -> None:
     for _ in range(RATE // 10):
         tick()
     assert node.arm.state == "stopped" and "joint_velocities" in node.arm.reason
+
+
+def tool_message(world: World, frame: str = "base") -> types.SimpleNamespace:
+    """The pose of the paddle as ROS has it."""
+    position, axes = world.tool()
+    quaternion = np.zeros(4)
+    mujoco.mju_mat2Quat(quaternion, axes.ravel())
+    pose = message(
+        position=message(**dict(zip("xyz", position, strict=True))),
+        orientation=message(**dict(zip("wxyz", quaternion, strict=True))),
+    )
+    return message(pose=pose, header=message(frame_id=frame))
+
+
+def test_a_ros2_bridge_takes_no_message_of_another_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    world, said = World(), []
+    bridge = ros_bridge(monkeypatch, world, said)
+    rests_at = world.data.ctrl[:6].tolist()
+    point = message(x=0.5, y=0.0, z=0.5)
+    stamp = message(sec=0, nanosec=0)
+    node = bridge["Bridge"](load_policy("robust"), rests_at, {"box": BOX}, "base", "/tool")
+    node.subscribed["/ball"](message(point=point, header=message(stamp=stamp, frame_id="camera")))
+    assert "ball_position" not in node.measurements
+    assert node.arm.state != "ready" and "'camera', not 'base'" in node.arm.reason
+    node = bridge["Bridge"](load_policy("robust"), rests_at, {"box": BOX}, "base", "/tool")
+    node.subscribed["/tool"](tool_message(world, "base_link"))
+    assert "tool_position" not in node.measurements
+    assert "the tool's pose has the frame_id 'base_link'" in node.arm.reason
+
+
+def test_a_ros2_bridge_sends_nothing_to_an_arm_with_another_tool(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    world, said = World(), []
+    bridge = ros_bridge(monkeypatch, world, said)
+    rests_at = world.data.ctrl[:6].tolist()
+    for off in (0.0, 0.1):
+        node = bridge["Bridge"](load_policy("robust"), rests_at, {"box": BOX}, "base", "/tool")
+        state = message(name=world.names, position=rests_at, velocity=[0.0] * 6)
+        tool = tool_message(world)
+        tool.pose.position.x += off
+        node.subscribed["/joint_states"](state)
+        node.subscribed["/tool"](tool)
+        ((_, tick),) = node.timers
+        tick()
+        assert hasattr(node, "sent") == (off == 0.0)
+    assert "check that the policy is of this arm" in node.arm.reason

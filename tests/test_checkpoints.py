@@ -22,7 +22,7 @@ from bounce_mjx.evaluation.results import Report, Result
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.policy import Policy
 from bounce_mjx.learning.ppo import PPO, TrainingState, policy_of
-from bounce_mjx.runs import checkpoints, files
+from bounce_mjx.runs import checkpoints, storage
 from bounce_mjx.runs.checkpoints import read_policy, read_training, save_checkpoint
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.folders import (
@@ -32,8 +32,8 @@ from bounce_mjx.runs.folders import (
     latest_checkpoint,
     stored_checkpoints,
 )
+from bounce_mjx.runs.layers import read_preset
 from bounce_mjx.runs.records import verify
-from bounce_mjx.runs.settings import read_preset
 from bounce_mjx.task.bounce import Config as BounceConfig
 
 OBSERVATION = BounceConfig().layout
@@ -192,12 +192,12 @@ def test_a_folder_of_a_run_without_a_checkpoint_is_told_from_a_run_without_one(
     with pytest.raises(UserError, match="as its training ended before the first one"):
         find_checkpoint(empty)
     # A manifest of a later version may mean something else.
-    files.seal(step_of(two))
-    manifest = step_of(two) / files.MANIFEST_FILE
+    storage.seal(step_of(two))
+    manifest = step_of(two) / storage.MANIFEST_FILE
     manifest.write_text(manifest.read_text().replace('"format": 1', '"format": 2'))
     with pytest.raises(UserError, match="damaged or of another version .*format"):
         verify(find_checkpoint(step_of(two)))
-    files.seal(step_of(two))
+    storage.seal(step_of(two))
 
 
 @pytest.mark.parametrize("wrong", [64, 128])
@@ -242,7 +242,7 @@ def test_a_checkpoint_that_is_not_read_as_it_was_given_replaces_no_other(
 
 
 def test_a_checkpoint_without_a_manifest_is_read_with_a_warning(run, state, capsys) -> None:
-    (step_of(run) / files.MANIFEST_FILE).unlink()
+    (step_of(run) / storage.MANIFEST_FILE).unlink()
     assert_identical(load_both(run, state), (policy_of(state, OBSERVATION.size), state))
     assert "has no manifest.json to find damage by" in capsys.readouterr().err
 
@@ -367,8 +367,8 @@ def test_code_in_any_file_is_not_run(written: Path, tmp_path: Path, state: Train
         for data in (pickle.dumps(Payload(target)), tagged):
             run = shutil.copytree(written, tmp_path / "run")
             (run / name).write_bytes(data)
-            if name.name != files.MANIFEST_FILE:
-                files.seal(step_of(run))
+            if name.name != storage.MANIFEST_FILE:
+                storage.seal(step_of(run))
             try:
                 loaded = load_both(run, state)
             except UserError:

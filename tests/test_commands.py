@@ -19,7 +19,7 @@ from bounce_mjx.config.command_line import flags_of, parse
 from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.folders import choose_checkpoint
-from bounce_mjx.runs.settings import Choice, read_layers, read_preset
+from bounce_mjx.runs.layers import Choice, read_layers, read_preset
 from bounce_mjx.training.command import fields_of_command
 from bounce_mjx.viewers.simulation import Simulation
 from tiny_runs import STEPS, TINY, TRAIN_SCRIPT, shared_run
@@ -83,10 +83,10 @@ MISTAKES = (
     ("play robust latest --log-dir typo", "there is no run with a checkpoint in typo"),
     ("eval --nominal --randomization.air-drag 0 1", "--nominal and --randomization", "omit one"),
     (
-        "eval robust --randomization.first-command-range 0.5 --randomization.warmup-steps 5",
+        "eval robust --randomization.first-goal-range 0.5 --randomization.warmup-steps 5",
         "--randomization is given without a term",
     ),
-    ("eval catch --target-height 0.5", "--target-height is not a command of the run's task; omit"),
+    ("eval catch --target-height 0.5", "--target-height is not a goal of the run's task; omit"),
     ("export robust --out a.onnx", "unknown argument --out; did you mean --onnx?"),
     ("eval robust --out=a.json", "unknown argument --out=a.json; did you mean --json?"),
     ("play robust --out a.mp4", "unknown argument --out; did you mean --video?"),
@@ -296,7 +296,7 @@ def test_eval_reports_five_results(trained: Path, tmp_path: Path, capsys) -> Non
         eval_command.main(line.split())
     assert exit_info.value.code == 1
     report = json.loads(file.read_text(), parse_constant=pytest.fail)
-    assert report["commands"] == {"target_height": 0.8}
+    assert report["goals"] == {"target_height": 0.8}
     assert report["world"] is None and report["randomization"] == {"ball_mass": [0.9, 1.1]}
     (unjudged,) = (result for result in report["results"] if result["passed"] is None)
     assert unjudged["name"] == "upward speed"

@@ -27,7 +27,7 @@ def recording(joint_angles: np.ndarray, running: np.ndarray | None = None) -> Re
         joint_angles=np.stack([joint_angles] * 2, axis=-1),
         ball=empty,
         paddle=empty,
-        command={},
+        goal={},
         running=running,
         terminated=np.zeros_like(running),
     )

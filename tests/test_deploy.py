@@ -23,7 +23,7 @@ from bounce_mjx.deploy.graph import onnx_graph
 from bounce_mjx.deploy.metadata import (
     TERMS_PER_JOINT,
     CommandLimits,
-    CommandRange,
+    GoalRange,
     from_entries,
     in_driver_order,
     to_entries,
@@ -83,7 +83,7 @@ ENVS = {
             "joint_angle_noise": (5e-5, 5e-5),
             "encoder_bias": (-0.003, 0.003),
             "joint_velocity_noise": (0.05, 0.05),
-            "command_interval": (0.3, 0.5),
+            "goal_interval": (0.3, 0.5),
         },
         **LEVEL,
     },
@@ -279,7 +279,7 @@ def test_metadata_describes_the_training_and_survives_the_file() -> None:
     }
     assert metadata.joint_names == tuple(f"Joint{i}" for i in range(1, 7))
     assert metadata.control_dt == config.control_dt and metadata.torque_limits == (None,) * 6
-    assert metadata.commands == {"target_height": CommandRange((0.4, 0.6), "m")}
+    assert metadata.goals == {"target_height": GoalRange((0.4, 0.6), "m")}
     assert metadata.servo_stiffness == (20000.0,) * 6 and metadata.servo_damping == (200.0,) * 6
     assert (metadata.task, metadata.robot, metadata.action_base) == ("bounce", "AIR4-560", "target")
     # In a control step of 10 ms at 2 rad/s.
@@ -345,14 +345,14 @@ def test_paddle_position_is_that_of_mujoco(tmp_path: Path) -> None:
         np.testing.assert_allclose(position, data.geom("blocker").xpos, atol=1e-12)
 
 
-def measured_by(sensing: Sensing, command: dict) -> dict[str, np.ndarray]:
+def measured_by(sensing: Sensing, goal: dict) -> dict[str, np.ndarray]:
     """Newest measurements in an environment's sensor memory."""
     names = ("joint_angles", "joint_velocities", "ball_quaternion", "ball_angular_velocity")
     known = sensing.histories
     measured = {name: np.asarray(known[name][0]) for name in names if name in known}
     return (
         measured
-        | command
+        | goal
         | {
             "ball_position": np.asarray(sensing.picture.position),
             "ball_velocity": np.asarray(sensing.picture.velocity),
@@ -368,10 +368,10 @@ def test_histories_are_those_of_the_environment(name: str, runs, policies) -> No
     step, state = jax.jit(env.step), jax.jit(env.reset)(jax.random.PRNGKey(5))
     policy.reset()
     own = {name: set() for name in env.config.observation.counts("task")}
-    commands, reached = set(), set()
+    goals, reached = set(), set()
     for i in range(300):
         state_now = state.pipeline_state
-        measured = measured_by(state_now.sensing, state_now.command)
+        measured = measured_by(state_now.sensing, state_now.goal)
         if name == "sensors":
             measured["ball_age"] = state_now.sensing.picture.age
         action = policy.step(measured | {"time": 7.0 + i * env.dt})
@@ -380,11 +380,11 @@ def test_histories_are_those_of_the_environment(name: str, runs, policies) -> No
         np.testing.assert_allclose(policy.observation, state.obs, 0, tolerance, err_msg=f"{i}")
         for quantity, values in own.items():
             values.add(tuple(policy.observation[env.layout[quantity]]))
-        commands |= set(map(float, state_now.command.values()))
+        goals |= set(map(float, state_now.goal.values()))
         reached |= set(np.flatnonzero(policy.observation))
         state = step(state, jnp.asarray(action, jnp.float32))
         assert not state.done, i
-    assert len(commands) >= (5 if name in ("sensors", "another task") else 1)
+    assert len(goals) >= (5 if name in ("sensors", "another task") else 1)
     # The start and at least four bounces.
     assert min(map(len, own.values())) >= 5
     # Every entry changed, except the ball's orientation and spin.
@@ -416,7 +416,7 @@ def test_a_policy_of_two_balls_sees_what_the_environment_sees(tmp_path: Path) ->
             "joint_velocities": sensing.histories["joint_velocities"][0],
             "ball_position": balls if i % 2 else balls.ravel(),
         }
-        action = policy.step(measured | now.command)
+        action = policy.step(measured | now.goal)
         np.testing.assert_allclose(policy.observation, state.obs, atol=1e-5, err_msg=f"step {i}")
         nexts.add(bool(policy.observation[env.layout["next_ball"]][3] > 0.0))
         state = step(state, jnp.asarray(action, jnp.float32))
@@ -424,7 +424,7 @@ def test_a_policy_of_two_balls_sees_what_the_environment_sees(tmp_path: Path) ->
     assert policy.metadata.num_balls == 2 and len(nexts) == 2
     for wrong in (np.zeros(3), np.zeros((3, 2))):
         with pytest.raises(UserError, match="ball_position has the shape .*; give 6 numbers"):
-            policy.step(measured | now.command | {"ball_position": wrong})
+            policy.step(measured | now.goal | {"ball_position": wrong})
 
 
 def measured_once() -> dict:
@@ -555,7 +555,7 @@ def test_a_task_need_not_look_at_its_last_quantities(tmp_path: Path) -> None:
     place = [part.name for part in policy.metadata.observation].index("aim")
     start = sum(part.history * part.size for part in policy.metadata.observation[:place])
     for step in range(3):
-        given = falling(0.01 * step) | dict.fromkeys(policy.metadata.commands, 0.5)
+        given = falling(0.01 * step) | dict.fromkeys(policy.metadata.goals, 0.5)
         policy.step({key: given[key] for key in policy.needs})
         aim = policy.observation[start : start + 2]
         np.testing.assert_allclose(aim, given["ball_position"][:2], atol=1e-6)
@@ -634,7 +634,7 @@ def test_load_policy_refuses_other_files(tmp_path: Path) -> None:
     model = onnx.load_from_string(shipped)
     broken |= {
         "ball_colour": edited(model, "observation", "ball_velocity", "ball_colour"),
-        "format is 1, not 4; export the policy again": edited(model, "format", "4", "1"),
+        "format is 1, not 5; export the policy again": edited(model, "format", "5", "1"),
     }
     del model.metadata_props[:]
     broken["lacks format"] = model.SerializeToString()

@@ -33,7 +33,7 @@ from bounce_mjx.config.user_code import import_code
 from bounce_mjx.errors import MissingPackage
 from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.runs.settings import Choice, read_layers, read_preset
+from bounce_mjx.runs.layers import Choice, read_layers, read_preset
 from bounce_mjx.task import registry, term_names, weighted_terms
 from bounce_mjx.task.bounce import Bounce
 from bounce_mjx.task.bounce_rewards import RewardInputs, Rewards
@@ -190,7 +190,7 @@ def known_flags() -> set[str]:
                 flags |= set(cli.flags_of(fields_in(member)))
     import_code(CHECKOUT / "examples/dribble_task.py")
     for task in (Bounce, find_task("dribble")):
-        flags |= {f"--{name}".replace("_", "-") for name in task.Config().commands}
+        flags |= {f"--{name}".replace("_", "-") for name in task.Config().goals}
     return flags
 
 

@@ -61,7 +61,7 @@ def with_task(state, target_height=None, **changes):
     """`state` with another target height, and other fields of the task."""
     pipeline = state.pipeline_state
     if target_height is not None:
-        pipeline = pipeline._replace(command={"target_height": jnp.float32(target_height)})
+        pipeline = pipeline._replace(goal={"target_height": jnp.float32(target_height)})
     changes = {
         name: jnp.asarray(value, getattr(pipeline.task, name).dtype)
         for name, value in changes.items()
@@ -122,7 +122,7 @@ def test_the_observation_is_mujocos_state(walked, model):
         assert np.all(np.abs(values) > 1e-4), "too small to tell from zero"
         np.testing.assert_allclose(walked.obs[entries], values, rtol=0, atol=1e-6)
     assert walked.obs.shape == (29,) and walked.obs.dtype == jnp.float32
-    assert walked.obs[28] == walked.pipeline_state.command["target_height"]
+    assert walked.obs[28] == walked.pipeline_state.goal["target_height"]
 
 
 N_RESETS = 2000
@@ -289,7 +289,7 @@ def test_reward_terms_follow_the_state(episodes, model):
                 "ball_position": data.body("ball_link").xpos.copy(),
                 "ball_velocity": data.joint("ball_link").qvel[:3].copy(),
                 "paddle_position": data.geom("blocker").xpos.copy(),
-                "target_height": before.pipeline_state.command["target_height"],
+                "target_height": before.pipeline_state.goal["target_height"],
                 "n_bounces": after.metrics["n_bounces"],
                 "bounced": after.metrics["bounced"] > 0,
                 "action": np.clip(action, -1, 1),

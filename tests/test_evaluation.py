@@ -249,13 +249,13 @@ def show(table) -> str:
 
 
 def test_upward_speed_is_judged_only_for_low_targets(env):
-    """Of the config, or of the commands that were drawn."""
+    """Of the config, or of the goals that were drawn."""
     for (low, high), judged in (((0.4, 0.6), True), ((0.3, 0.6), False), ((0.4, 0.8), False)):
         configured = BounceBall(EnvConfig(target_height_range=(low, high)))
         for speed, passed in ((900, True), (9000, False)):
             figures = statistics(rising_speed=speed)
             given = {"target_height": (low, high)}
-            reports = judge(configured, figures), judge(env, figures, commands=given)
+            reports = judge(configured, figures), judge(env, figures, goals=given)
             for report in reports:
                 assert report.results[SPEED].passed is (passed if judged else None)
                 np.testing.assert_allclose(report.results[SPEED].value, speed / 900)
@@ -420,26 +420,26 @@ def test_an_episode_that_diverges_on_c_ends(networks, random_policy, monkeypatch
 
 
 @pytest.mark.slow
-def test_worlds_and_commands_are_those_of_the_training_or_of_the_options(monkeypatch):
-    """A given command replaces a drawn one, also where the world of the training changes it. A
-    nominal evaluation draws no world, and its commands are the task's. The report is judged by the
-    commands that were drawn."""
-    drawn = {"command_interval": (2.0, 4.0), "air_drag": (0.1, 0.2)}
+def test_worlds_and_goals_are_those_of_the_training_or_of_the_options(monkeypatch):
+    """A given goal replaces a drawn one, also where the world of the training changes it. A
+    nominal evaluation draws no world, and its goals are the task's. The report is judged by the
+    goals that were drawn."""
+    drawn = {"goal_interval": (2.0, 4.0), "air_drag": (0.1, 0.2)}
     config = EnvConfig(target_height_range=(0.3, 0.8), randomization=drawn)
     seen, passed = [], []
 
     def make_evaluator(env, networks, episodes, recorded):
         def evaluate(policy, key, ranges):
             state = reset_episodes(env, key, episodes, ranges).pipeline_state
-            seen.append(jax.tree.map(lambda x: x[..., 0], (state.world, state.command)))
+            seen.append(jax.tree.map(lambda x: x[..., 0], (state.world, state.goal)))
             # Too fast for a low target; at others the speed is not judged.
             return statistics(rising_speed=9000), None
 
         return evaluate
 
     monkeypatch.setattr(policy_evaluation, "make_evaluator", make_evaluator)
-    for nominal, commands in itertools.product((False, True), ({}, {"target_height": 0.5})):
-        options = EvaluationOptions(episodes=2, nominal=nominal, commands=commands)
+    for nominal, goals in itertools.product((False, True), ({}, {"target_height": 0.5})):
+        options = EvaluationOptions(episodes=2, nominal=nominal, goals=goals)
         evaluated = evaluate_policy(None, config, networks_of(PPOConfig()), options)
         passed.append(evaluated.report.results[SPEED].passed)
     (own, height), (own_but_one, given), (none, tasks), (still_none, also_given) = seen
@@ -509,6 +509,19 @@ def test_a_least_share_that_is_no_share_is_refused(least: float) -> None:
 def test_bounds_between_which_nothing_lies_are_refused() -> None:
     with pytest.raises(UserError, match="the result rate has the bounds 5 and 3; give the lower"):
         mean_of_events("rate", "apexes a second", np.ones(3), np.ones(3), (5.0, 3.0))
+
+
+def test_a_share_has_its_unit_once() -> None:
+    for words in (
+        "steps left of the line",
+        "steps left of the line, %",
+        "steps left of the line %",
+    ):
+        for result in (
+            share_of_events("left", words, np.ones(3), np.ones(3), 0.5),
+            share_of_episodes("left", words, np.ones(3, bool), 0.5),
+        ):
+            assert result.measured == "steps left, %"
 
 
 LASTS = share_of_episodes("lasts", "episodes", np.ones(3, bool), 0.9)

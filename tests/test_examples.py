@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from bounce_mjx.runs.settings import read_preset
+from bounce_mjx.runs.layers import read_preset
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 # Three environments, whose compiled step the examples share.

@@ -147,8 +147,8 @@ def test_each_failure_has_its_world_and_its_time(conditions, measured) -> None:
         for name, value in one.world.items():
             # A program that is not compiled as a whole may round once more.
             np.testing.assert_allclose(value, states.world[name][..., one.episode], atol=1e-6)
-        height = states.command["target_height"][one.episode]
-        assert one.command == {"target_height": pytest.approx(float(height))}
+        height = states.goal["target_height"][one.episode]
+        assert one.goal == {"target_height": pytest.approx(float(height))}
 
 
 def test_an_episode_misses_what_was_measured_of_it(env) -> None:
@@ -191,11 +191,11 @@ def test_the_terms_that_go_with_failure_are_named() -> None:
         episode_return=np.ones(600),
         tally=Tally({}, {}),
         world=world,
-        command={"target_height": np.full(600, 0.5)},
+        goal={"target_height": np.full(600, 0.5)},
     )
     failures = [Failure(int(i), 1.0, False, ("stable",), {}, {}) for i in np.flatnonzero(fails)]
     found = associations(statistics, failures)
-    # A command that does not vary cannot go with anything.
+    # A goal that does not vary cannot go with anything.
     assert [one.name for one in found if one.is_clear] == ["action_latency"]
     assert {one.name for one in found} == {"action_latency", "paddle_tilt[0]", "paddle_tilt[1]"}
     assert [third.failed for third in found[0].thirds[:2]] == [0, 0]
@@ -215,7 +215,7 @@ def test_the_worst_episode_ends_first_or_has_the_lowest_return() -> None:
             joint_angles=None,
             ball=None,
             paddle=None,
-            command={},
+            goal={},
             running=running,
             terminated=terminated,
             metrics={"reward/height": values},

@@ -10,9 +10,9 @@ import pytest
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.resources import resource_path
-from bounce_mjx.runs.files import check_output, new_file, write_atomically, write_output
+from bounce_mjx.runs.layers import read_preset
 from bounce_mjx.runs.presets import default_preset
-from bounce_mjx.runs.settings import read_preset
+from bounce_mjx.runs.storage import check_output, new_file, write_atomically, write_output
 from bounce_mjx.task.bounce import Config as EnvConfig
 from bounce_mjx.training.setup import JOINED_LOOPS, cache_compilations, join_loops
 

@@ -29,8 +29,8 @@ def ramp(over: tuple[int, ...] = ()) -> EnvFrame:
     wide = np.repeat(value[..., None], 3, axis=-1)
     ended = np.zeros((11, 1), bool)
     ended[list(over)] = True
-    command, metrics = {"height": value}, {"count": value}
-    return EnvFrame(value * 0.01, wide, wide[:, :, None], wide, command, metrics, ended, ended)
+    goal, metrics = {"height": value}, {"count": value}
+    return EnvFrame(value * 0.01, wide, wide[:, :, None], wide, goal, metrics, ended, ended)
 
 
 def test_resampling_interpolates_positions() -> None:
@@ -40,8 +40,8 @@ def test_resampling_interpolates_positions() -> None:
     np.testing.assert_allclose(frames.time[:, 0], times)
     for positions in (frames.qpos, frames.balls[:, 0], frames.paddle):
         np.testing.assert_allclose(positions[:, 0, 0], 100 * times)
-    # Commands and metrics come from the last step.
-    for values in (frames.command["height"], frames.metrics["count"]):
+    # Goals and metrics come from the last step.
+    for values in (frames.goal["height"], frames.metrics["count"]):
         np.testing.assert_array_equal(values[:, 0], np.floor(100 * times + 1e-9))
 
 
@@ -88,7 +88,7 @@ def test_a_replay_shows_the_path_and_the_loss_for_as_long_as_the_live_page(
     lost = ramp(over=(10,))
     lost = lost._replace(
         qpos=np.tile(env.mj_model.qpos0, (11, 1, 1)),
-        command={"target_height": np.full((11, 1), 0.5)},
+        goal={"target_height": np.full((11, 1), 0.5)},
         metrics={"n_bounces": np.zeros((11, 1))},
     )
     scenes, seconds = [], []

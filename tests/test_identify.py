@@ -80,7 +80,7 @@ from bounce_mjx.physics import (
 )
 from bounce_mjx.reports.identification import identification_page, inspection_page
 from bounce_mjx.robot.model import find_addresses, link_bodies
-from bounce_mjx.runs.settings import read_preset
+from bounce_mjx.runs.layers import read_preset
 from bounce_mjx.world.actuation import Actuators
 from bounce_mjx.world.model import world_model
 from bounce_mjx.world.named import read_world

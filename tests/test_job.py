@@ -35,10 +35,10 @@ from bounce_mjx.runs.folders import (
     find_checkpoint,
     latest_checkpoint,
     lock_run,
-    named_run,
+    run_or_newest,
     stored_checkpoints,
 )
-from bounce_mjx.runs.settings import Choice, read_layers
+from bounce_mjx.runs.layers import Choice, read_layers
 from bounce_mjx.training import hosts, job, saving
 from bounce_mjx.training.events import Event
 from bounce_mjx.training.faults import first_block_fault
@@ -467,7 +467,7 @@ def test_a_signal_saves_and_says_how_to_resume(tmp_path: Path, number: signal.Si
     assert num_evaluations == 1
     (run,) = tmp_path.iterdir()
     continues = f"stopped after 128 steps; continue with: bounce-mjx train {run}"
-    assert continues in str(stopped.value)
+    assert f"{continues} (its report so far: bounce-mjx report {run})" in str(stopped.value)
     assert latest_checkpoint(run).steps == 2 * BLOCK
     train(tmp_path, RETURNS, run)
     assert evaluated_steps(run) == [64, 128, 192, 256]
@@ -835,7 +835,7 @@ def test_each_seed_has_a_run_of_its_own_and_the_best_one_is_found(tmp_path: Path
         assert evaluated_steps(folder) == [64, 128, 192]
         assert results_of(folder)["best_steps"] == BLOCK * best
         assert iterations_of(best_checkpoint(folder)) == best
-    assert find_checkpoint(named_run(None, tmp_path)) == best_checkpoint(folders[1])
+    assert find_checkpoint(run_or_newest(None, tmp_path)) == best_checkpoint(folders[1])
     # Resumed, each knows its best one.
     train(tmp_path, returns | {4: (2.5, 9.0, 1.0)}, run, num_seeds=SEEDS)
     assert [results_of(folder)["best_steps"] for folder in folders] == [128, 256, 192]

@@ -54,8 +54,8 @@ def truth(balls: np.ndarray, velocities: np.ndarray) -> task.Kinematics:
 def stepped(
     state: tuple, balls: jax.Array, velocities: jax.Array, height: float = 0.5
 ) -> task.TaskStep:
-    command, action = {"target_height": jnp.float32(height)}, jnp.zeros(6)
-    return JUGGLE.step(state, task.Step(truth(balls, velocities), command, action, action))
+    goal, action = {"target_height": jnp.float32(height)}, jnp.zeros(6)
+    return JUGGLE.step(state, task.Step(truth(balls, velocities), goal, action, action))
 
 
 def test_hits_count_in_turns() -> None:
@@ -231,7 +231,7 @@ def test_each_result_is_judged_by_its_own_figure() -> None:
         },
         maxima={"touched": np.zeros(count)},
         lasted=np.ones(count, bool),
-        commands={},
+        goals={},
     )
     assert all(result.passed for result in JUGGLE.results(good))
     few = np.arange(count) < 3

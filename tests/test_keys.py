@@ -52,7 +52,7 @@ VALUES = {
     "algorithm": "own",
     "ppo.min_learning_rate": 2e-5, "env.randomization.camera_rate": [60, 90],
     "env.randomization.ball_start": [0.0, 0.05], "env.randomization.joint_start": [-0.05, 0.05],
-    "env.randomization.command_interval": [1, 2], "env.physics": "mjx", "ppo.decay_steps": 1000,
+    "env.randomization.goal_interval": [1, 2], "env.physics": "mjx", "ppo.decay_steps": 1000,
 }  # fmt: skip
 
 # Keys that are refused alone, and the settings with which each has an effect; None where the
@@ -72,7 +72,7 @@ VARIED = {"restitution": [0.8, 0.9]}
 NEEDED = {
     "env.action.max_lead": {"action": {"base": "target"}},
     "env.observation.servo_lead": {"action": {"base": "target"}},
-    "env.randomization.first_command_range": {"randomization": VARIED | {"warmup_steps": 1000}},
+    "env.randomization.first_goal_range": {"randomization": VARIED | {"warmup_steps": 1000}},
     "env.randomization.warmup_steps": {"randomization": VARIED},
     "env.randomization.push_interval": {"randomization": {"push_speed": [0.1, 0.1]}},
     **{f"env.robot.limits.{name}": WITH_LIMITS for name in LIMITS},

@@ -200,7 +200,7 @@ def recorded(velocities: np.ndarray) -> Recording:
         joint_angles=joint_angles,
         ball=empty,
         paddle=empty,
-        command={},
+        goal={},
         running=running,
         terminated=np.zeros_like(running),
         command_velocity=velocities[..., None],

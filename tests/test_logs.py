@@ -19,7 +19,7 @@ from bounce_mjx.identify.log import Log, align_clocks, check
 from bounce_mjx.identify.reading import read_bag, read_csv, read_log
 from bounce_mjx.identify.sensors import measure_camera
 from bounce_mjx.robot.model import find_addresses, load_model
-from bounce_mjx.runs.settings import read_preset
+from bounce_mjx.runs.layers import read_preset
 from bounce_mjx.world.model import world_model
 
 JOINTS = ("left", "right")

@@ -12,7 +12,7 @@ from bounce_mjx.baselines.mirror import MirrorLaw, observing
 from bounce_mjx.env.env import Env
 from bounce_mjx.evaluation.episodes import make_evaluator
 from bounce_mjx.evaluation.results import judge
-from bounce_mjx.runs.settings import read_preset
+from bounce_mjx.runs.layers import read_preset
 
 GRAVITY = 9.81
 

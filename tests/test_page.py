@@ -46,11 +46,11 @@ def page(mirrored: Simulation, monkeypatch) -> Iterator[tuple[Client, dict[str, 
     did: dict[str, list] = {"shown": [], "speed": [], "target": [], "push": []}
     for owner, method, record in (
         (Scene, "show", lambda _, number: did["shown"].append(number)),
-        (Simulation, "step", lambda one: did["target"].append(one.command.get("target_height"))),
+        (Simulation, "step", lambda one: did["target"].append(one.goal.get("target_height"))),
         (Simulation, "push", lambda _, velocity: did["push"].append(velocity)),
     ):
         watch(monkeypatch, owner, method, record)
-    mirrored.command = {}
+    mirrored.goal = {}
     make_clock = browser.in_real_time
 
     def clock(simulation, seconds, speed):
@@ -63,7 +63,7 @@ def page(mirrored: Simulation, monkeypatch) -> Iterator[tuple[Client, dict[str, 
     monkeypatch.setattr(browser, "in_real_time", clock)
     with served(mirrored, monkeypatch) as client:
         yield client, did
-    mirrored.command = {}
+    mirrored.goal = {}
 
 
 def stands_still(did: dict[str, list]) -> bool:
@@ -195,8 +195,8 @@ def test_a_paused_page_shows_the_values_that_hold(page, mirrored: Simulation) ->
     client.set(height, 0.8)
     client.values.clear()
     client.set(sampled, True)
-    wait_until(lambda: mirrored.command == {})
-    holds = round(float(mirrored.frame.command["target_height"][0]), 2)
+    wait_until(lambda: mirrored.goal == {})
+    holds = round(float(mirrored.frame.goal["target_height"][0]), 2)
     while client.values.get(height) != holds:
         client.receive()
     client.press("pause")
@@ -270,7 +270,7 @@ def test_no_client_can_end_the_server_or_leave_a_range(page, capfd) -> None:
 
 
 @pytest.mark.slow
-def test_the_page_shows_the_commands_of_any_task(monkeypatch) -> None:
+def test_the_page_shows_the_goals_of_any_task(monkeypatch) -> None:
     env = Env(LeanConfig(physics="fused"))
     leaning = Simulation(env, make_zero_controller(env), 2, seed=0)
     with served(leaning, monkeypatch) as client:
@@ -285,15 +285,15 @@ def test_the_page_shows_the_commands_of_any_task(monkeypatch) -> None:
         assert any(">calm<" in text for text in client.texts)
         client.set(client.control("angle, rad"), 0.0)
         client.press("lean angle up")
-        wait_until(lambda: leaning.command == {"lean_angle": 0.1})
+        wait_until(lambda: leaning.goal == {"lean_angle": 0.1})
         wait_until(lambda: "twice 0.2   pace 2" in client.labels())
         for _ in range(2):
             client.press("lean angle up")
-        wait_until(lambda: leaning.command == {"lean_angle": 0.2})
+        wait_until(lambda: leaning.goal == {"lean_angle": 0.2})
         client.set(client.control("pace"), 3.0)
-        wait_until(lambda: leaning.command == {"lean_angle": 0.2, "pace": 3.0})
+        wait_until(lambda: leaning.goal == {"lean_angle": 0.2, "pace": 3.0})
         client.set(client.control("gait"), "slow run")
-        wait_until(lambda: leaning.command.get("gait") == 1.0)
+        wait_until(lambda: leaning.goal.get("gait") == 1.0)
 
 
 @pytest.fixture

@@ -4,9 +4,12 @@ import base64
 import io
 import json
 import math
+import os
 import re
 import resource
 import shutil
+import signal
+import threading
 import time
 import xml.etree.ElementTree
 from pathlib import Path
@@ -26,6 +29,7 @@ from bounce_mjx import BounceBall
 from bounce_mjx.commands import plot as plot_command
 from bounce_mjx.commands import report as report_command
 from bounce_mjx.commands import train as train_command
+from bounce_mjx.config.command_line import stdout
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.results import Report
@@ -45,8 +49,8 @@ from bounce_mjx.reports.figures import curves_figure, rewards_figure
 from bounce_mjx.reports.tables import result_cells, results_table, unsolved_line
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.folders import save_config
+from bounce_mjx.runs.layers import read_preset
 from bounce_mjx.runs.progress import load_results
-from bounce_mjx.runs.settings import read_preset
 from bounce_mjx.task import Curve, term_names
 from bounce_mjx.task.bounce import Bounce, Rewards
 from bounce_mjx.task.bounce import Config as BounceConfig
@@ -55,7 +59,10 @@ from bounce_mjx.task.results import Result
 from bounce_mjx.task.task import Hits
 from bounce_mjx.training import setup
 from bounce_mjx.training.events import Event
+from bounce_mjx.training.job import TrainingStopped
 from bounce_mjx.training.log import TensorBoardLog
+from bounce_mjx.training.run import leave_report
+from bounce_mjx.training.seeds import SeedRun
 from tiny_runs import TINY
 
 CHECKOUT = Path(__file__).parents[1]
@@ -382,7 +389,8 @@ def test_a_missed_bound_is_not_printed_as_its_value(value, bound, passed, text: 
 def test_the_advice_after_several_seeds_is_not_to_train_several() -> None:
     report = Report((Result("stable", "episodes, %", 90.0, ">= 99", False),), {})
     assert "--num-seeds" in unsolved_line(report)
-    assert "each of the 2 seeds is in a local optimum" in unsolved_line(report, num_seeds=2)
+    # Nor is a training, however short, told why it has not solved its task.
+    assert "train longer while the return rises" in unsolved_line(report, num_seeds=2)
     assert "--num-seeds" not in unsolved_line(report, num_seeds=2)
 
 
@@ -460,6 +468,37 @@ def test_a_failure_to_draw_does_not_lose_the_training(tmp_path: Path, monkeypatc
     shown = capsys.readouterr().out
     assert f"report: not drawn (no fonts); draw it with: bounce-mjx report {run}\n" in shown
     assert shown.index("best checkpoint") < shown.index("report: not drawn")
+
+
+def test_a_signal_while_the_report_is_drawn_says_how_to_draw_it(
+    tmp_path: Path, monkeypatch
+) -> None:
+    """It does not wait for the drawing, whose run is already saved."""
+    is_drawn = threading.Event()
+
+    def draw(*_) -> None:
+        os.kill(os.getpid(), signal.SIGTERM)
+        is_drawn.wait()
+
+    monkeypatch.setattr(report_page, "write_report", draw)
+    seed = SeedRun(tmp_path, TrainConfig(), {})
+    seed.progress.best = Report((), {})
+    words = f"report: not drawn, as a signal came; draw it with: bounce-mjx report {tmp_path}"
+    with pytest.raises(TrainingStopped, match=re.escape(words)):
+        leave_report(seed, stdout(quiet=True))
+    is_drawn.set()
+
+
+def test_a_metric_that_no_curve_names_has_a_panel() -> None:
+    points = LoggedCurve(np.array([1e6, 2e6]), np.array([0.1, 0.2]))
+    curves = {"episode/return": points, "task/left_of": points, "task/too_fast": points}
+    curves |= {"task/hidden": points, "reward/right": points}
+    hidden = (Curve("task/hidden", "hidden", title=""),)
+    group = Group("one run", [RunCurves(Path("run"), curves, None)], hidden)
+    assert [axes.get_title() for axes in curves_figure([group]).axes] == [
+        "return of an episode",
+        "left of",
+    ]
 
 
 def test_tensorboard_reads_everything_back(trained: Path) -> None:

@@ -28,8 +28,8 @@ from bounce_mjx.runs.folders import (
     is_users_run,
     pretrained_checkpoint,
 )
+from bounce_mjx.runs.layers import read_preset
 from bounce_mjx.runs.progress import load_results
-from bounce_mjx.runs.settings import read_preset
 from bounce_mjx.runs.worlds import trained_in
 from bounce_mjx.task.registry import find_task
 
@@ -61,7 +61,7 @@ def test_what_a_release_wrote_is_loaded(release: Path, tmp_path: Path) -> None:
     earlier format is refused, and a new export gives the checkpoint's action."""
     config, results = load_run_config(release), load_results(release)
     assert results is not None and results.best.passed
-    with pytest.raises(UserError, match="its format is 3, not 4; export the policy again"):
+    with pytest.raises(UserError, match="its format is 3, not 5; export the policy again"):
         load_policy(release / "policy.onnx")
     env = BounceBall(config.env)
     observation = np.asarray(env.reset(jax.random.PRNGKey(0)).obs)
@@ -98,7 +98,7 @@ def test_each_task_has_a_policy(task: str, tmp_path: Path, monkeypatch) -> None:
         assert chosen == best_checkpoint(folder)
     assert (folder / f"{task}.onnx").read_bytes() == export_onnx(chosen)
     policy = load_policy(task)
-    assert set(policy.metadata.commands) == set(find_task(task).Config().commands)
+    assert set(policy.metadata.goals) == set(find_task(task).Config().goals)
 
 
 @pytest.mark.parametrize("arm", ARM_POLICIES)

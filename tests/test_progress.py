@@ -12,9 +12,9 @@ import pytest
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.runs.checkpoints import read_policy
 from bounce_mjx.runs.config import load_run_config
-from bounce_mjx.runs.files import to_json, write_output
 from bounce_mjx.runs.folders import pretrained_checkpoint
 from bounce_mjx.runs.progress import Progress
+from bounce_mjx.runs.storage import to_json, write_output
 from bounce_mjx.task import Result
 
 

@@ -131,8 +131,8 @@ def test_a_reset_takes_ranges_of_all_terms_alone(names: tuple[str, ...], words: 
         jax.eval_shape(lambda key: env.reset(key, ranges), jax.random.key(0))
 
 
-def test_the_range_of_a_command_grows_about_its_middle() -> None:
-    grows = {"first_command_range": 0.2, "warmup_steps": 1000}
+def test_the_range_of_a_goal_grows_about_its_middle() -> None:
+    grows = {"first_goal_range": 0.2, "warmup_steps": 1000}
     env = BounceBall(EnvConfig(target_height_range=(0.3, 0.8), randomization=grows))
 
     def ends(progress: float) -> list[float]:
@@ -142,12 +142,12 @@ def test_the_range_of_a_command_grows_about_its_middle() -> None:
     assert ends(0.5) == pytest.approx([0.4, 0.7])
     assert ends(1.0) == pytest.approx([0.3, 0.8])
     heights = [
-        env.reset(jax.random.key(i), env.ranges(0.0)).pipeline_state.command["target_height"]
+        env.reset(jax.random.key(i), env.ranges(0.0)).pipeline_state.goal["target_height"]
         for i in range(8)
     ]
     assert 0.5 <= min(heights) < max(heights) <= 0.6
-    with pytest.raises(ValueError, match="first_command_range is given without warmup_steps"):
-        EnvConfig(randomization={"first_command_range": 0.2})
+    with pytest.raises(ValueError, match="first_goal_range is given without warmup_steps"):
+        EnvConfig(randomization={"first_goal_range": 0.2})
 
 
 @pytest.mark.slow
@@ -518,7 +518,7 @@ def run(moves: bool) -> Run:
     actuation. The balls start low and the actions are small, so that the balls bounce and keep
     bouncing."""
     terms = {
-        "push_speed": (0.02, 0.05), "push_interval": (0.3, 0.6), "command_interval": (0.4, 0.7),
+        "push_speed": (0.02, 0.05), "push_interval": (0.3, 0.6), "goal_interval": (0.4, 0.7),
         "ball_start": (-0.02, 0.02), "joint_start": (-0.02, 0.02),
     }  # fmt: skip
     terms |= {} if not moves else {
@@ -543,7 +543,7 @@ def run(moves: bool) -> Run:
 
         def telling_step(state, step):
             done = task_step(state, step)
-            return done._replace(metrics=done.metrics | {"height": step.command["target_height"]})
+            return done._replace(metrics=done.metrics | {"height": step.goal["target_height"]})
 
         env.task.step = telling_step
         keys = jax.random.split(jax.random.PRNGKey(3), WORLDS)
@@ -561,7 +561,7 @@ def run(moves: bool) -> Run:
                     physics = env.engine.step(pipeline.parameters, physics, control, 10)
                 after = env.finish_step(state, action, actuation, physics)
                 pipeline = after.pipeline_state
-                target = pipeline.command["target_height"]
+                target = pipeline.goal["target_height"]
                 seen = (physics, control, target, pipeline.redraw.age, after.metrics["height"])
                 return after, seen
 
@@ -664,12 +664,12 @@ def test_pushes_have_their_size_and_interval(at_rest: Run) -> None:
 
 def test_targets_change_at_their_interval(at_rest: Run) -> None:
     world = at_rest.starts.pipeline_state.world
-    start = at_rest.starts.pipeline_state.command["target_height"]
+    start = at_rest.starts.pipeline_state.goal["target_height"]
     heights = np.concatenate([start[None], at_rest.target_height])
     assert 0.3 <= heights.min() < 0.35 and 0.75 < heights.max() <= 0.8
     for w in range(WORLDS):
         changed = np.flatnonzero(np.diff(heights[:, w]))
-        interval = float(world["command_interval"][w]) / 0.01
+        interval = float(world["goal_interval"][w]) / 0.01
         grid = changed[0] + interval * np.arange(len(changed))
         assert np.abs(changed - grid).max() <= 1.0 + 1e-6
         assert len(changed) >= int(CONTROL_STEPS / interval) - 1

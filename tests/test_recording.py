@@ -91,7 +91,7 @@ def test_a_recording_holds_the_first_episodes(evaluated, stepped) -> None:
         "joint_angles": recording.joint_angles,
         "ball_position": recording.ball,
         "paddle_position": recording.paddle,
-        "target_height": recording.command["target_height"][:, None],
+        "target_height": recording.goal["target_height"][:, None],
     }
     for name, recorded in parts.items():
         expected = stepped.obs[:, LAYOUT[name]]
@@ -117,7 +117,7 @@ def made_up(steps: int, episodes: int) -> Recording:
         joint_angles=np.zeros((steps, 6, episodes), np.float32),
         ball=np.zeros((steps, 3, episodes), np.float32),
         paddle=np.zeros((steps, 3, episodes), np.float32),
-        command={"target_height": np.zeros((steps, episodes), np.float32)},
+        goal={"target_height": np.zeros((steps, episodes), np.float32)},
         running=np.ones((steps, episodes), bool),
         terminated=np.zeros((steps, episodes), bool),
         metrics={
@@ -141,11 +141,11 @@ def test_no_bounce_is_drawn_that_the_result_does_not_judge() -> None:
     """Of two episodes whose target changes: drawn are the tally's `settled_bounces`."""
     recording = made_up(8, 2)
     recording.metrics["bounced"][:] = 1.0
-    recording.command["target_height"][:] = 0.5
+    recording.goal["target_height"][:] = 0.5
     # Within the first 2 s, and after them.
     changes = {0: 1, 1: 4}
     for episode, change in changes.items():
-        recording.command["target_height"][change:, episode] = 0.6
+        recording.goal["target_height"][change:, episode] = 0.6
     _, hits = drawn(recording, control_dt=1.0)
     task = Bounce(EnvConfig(episode_seconds=8.0).model_copy(update={"control_dt": 1.0}))
     truth = Kinematics(None, jnp.zeros(3), None, None, jnp.zeros(3), None, None)
@@ -155,11 +155,11 @@ def test_no_bounce_is_drawn_that_the_result_does_not_judge() -> None:
         since_change = step - changes[episode]
         moment = Moment(
             truth=truth,
-            command={},
+            goal={},
             state=None,
             metrics=metrics,
             seconds=seconds,
-            command_seconds=seconds if since_change < 0 else float(since_change),
+            goal_seconds=seconds if since_change < 0 else float(since_change),
         )
         assert hits.steps[step, episode] == task.tally(moment).sums["settled_bounces"]
 

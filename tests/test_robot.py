@@ -35,7 +35,7 @@ from bounce_mjx.robot.config import PaddleConfig, RobotConfig
 from bounce_mjx.robot.model import data_at, find_addresses, joint_names, load_model
 from bounce_mjx.robot.pose import clearance, mounts, place_paddle
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.runs.settings import read_preset
+from bounce_mjx.runs.layers import read_preset
 from random_worlds import random_parameters
 
 FINGERS = "".join(

@@ -43,7 +43,7 @@ def suite(tmp_path: Path, *perturbations: object, trained: EnvConfig | None = No
     path = suite_file(tmp_path, *perturbations)
     nominal, *others = load_suite(path, trained or EnvConfig())
     assert (nominal.perturbation.name, nominal.trained) == ("nominal", True)
-    assert nominal.ranges.keys() == nominal.env.commands.keys()
+    assert nominal.ranges.keys() == nominal.env.goals.keys()
     return others
 
 
@@ -77,8 +77,8 @@ def test_strengths_have_a_unit_and_values_a_shape(tmp_path: Path) -> None:
     np.testing.assert_allclose(start.ranges["air_drag"], [0.1, 0.1])
     assert (start.strength, real.strength) == (5.0, None)
     np.testing.assert_allclose(real.ranges["servo_gain"], np.full((2, 6), 0.9))
-    assert real.commands == {"target_height": (0.3, 0.8)}
-    assert tilt.commands == {"target_height": EnvConfig().target_height_range}
+    assert real.goals == {"target_height": (0.3, 0.8)}
+    assert tilt.goals == {"target_height": EnvConfig().target_height_range}
 
 
 def test_settings_change_the_task_and_drop_the_training_world(tmp_path: Path) -> None:
@@ -124,8 +124,8 @@ def test_the_trained_ranges_contain_a_condition_or_not(tmp_path: Path) -> None:
     assert [c.trained for c in conditions] == [True, True, False, True, False, False, True]
     np.testing.assert_allclose(conditions[-1].ranges["gravity_tilt"], [[-0.02] * 2, [0.02] * 2])
     assert conditions[-1].ranges.keys() == {"action_latency", "gravity_tilt", "target_height"}
-    assert conditions[-1].commands == {"target_height": (0.3, 0.8)}
-    assert conditions[0].commands == {"target_height": (0.4, 0.6)}
+    assert conditions[-1].goals == {"target_height": (0.3, 0.8)}
+    assert conditions[0].goals == {"target_height": (0.4, 0.6)}
     # In a named world, whose settings differ from the training's, it is the training's own.
     world = EnvConfig(action_scale=0.02)
     *others, own = load_suite(suite_file(tmp_path, late, everything), trained, world)
@@ -140,8 +140,8 @@ def test_a_training_that_always_has_a_term_does_not_contain_a_world_without(tmp_
     latency = dict(name="late", unit="ms", strengths=[0, 20], terms={"action_latency": "strength"})
     path = suite_file(tmp_path, latency)
     always = {"action_latency": (0.015, 0.045)}
-    # What has no neutral value, and how often commands change, is not asked.
-    others = {"camera_rate": (60.0, 120.0), "command_interval": (3.0, 8.0), "air_drag": (0.0, 0.2)}
+    # What has no neutral value, and how often goals change, is not asked.
+    others = {"camera_rate": (60.0, 120.0), "goal_interval": (3.0, 8.0), "air_drag": (0.0, 0.2)}
     for randomization, expected in (
         (always | others, [False, False, True]),
         (always | others | {"share": 0.5}, [True, True, True]),
@@ -171,11 +171,11 @@ MISTAKES = {
         [LATE | {"terms": {"action_latencies": "strength"}}],
         "unknown key randomization.action_latencies; did you mean randomization.action_latency?",
     ),
-    "limit of a command": (
+    "limit of a goal": (
         [LATE | {"terms": {"target_height": {"from": 0, "to": "strength"}}}],
         "'late' at 0.01: target_height is 0, but must be a finite number >= 0.05",
     ),
-    "order of a command": (
+    "order of a goal": (
         [LATE | {"strengths": [0.4], "terms": {"target_height": {"from": 0.5, "to": "strength"}}}],
         "'late' at 0.4: target_height is from 0.5 to 0.4; exchange the two",
     ),
@@ -216,8 +216,8 @@ def test_every_condition_gets_its_own_ranges_and_outcome(tmp_path: Path, monkeyp
         terms = env.config.randomization.terms
 
         def evaluate(policy, key, ranges):
-            given_commands = sorted((ranges or {}).keys() - set(terms))
-            calls.append((*terms, *given_commands, count))
+            given_goals = sorted((ranges or {}).keys() - set(terms))
+            calls.append((*terms, *given_goals, count))
             given = {name: np.repeat(low, 4) for name, (low, _) in (ranges or {}).items()}
             late = given.get("action_latency", np.zeros(count))
             rate = given.get("camera_rate", np.zeros(count))
@@ -301,7 +301,7 @@ def test_each_condition_is_judged_as_an_evaluation_in_its_own_world(tmp_path, mo
     (tmp_path / "suite.yaml").write_text(yaml.safe_dump(content))
     conditions = load_suite(tmp_path / "suite.yaml", trained)
     # Not the pushes that the task's own world has.
-    assert conditions[0].ranges.keys() == trained.commands.keys()
+    assert conditions[0].ranges.keys() == trained.goals.keys()
 
     def make_evaluator(env, networks, count):
         sums = {"steps": np.ones(count), "squares": np.full(count, 0.012**2)}
@@ -399,7 +399,7 @@ def test_command_writes_its_results(measured, tmp_path: Path, monkeypatch, capsy
 
 @pytest.mark.slow
 def test_a_perturbation_of_one_task_is_skipped_for_others(tmp_path: Path) -> None:
-    """The shipped suite runs for a task without its commands, whose own command has its limits."""
+    """The shipped suite runs for a task without its goals, whose own goal has its limits."""
     import_code(DRIBBLE)
     dribble = find_task("dribble").Config()
     shipped, of_bounce = (
@@ -409,14 +409,14 @@ def test_a_perturbation_of_one_task_is_skipped_for_others(tmp_path: Path) -> Non
     names = {c.perturbation.name for c in of_bounce} - {c.perturbation.name for c in shipped}
     assert names == {"target height", "target changes every"}
     assert len(of_bounce) - len(shipped) == 8
-    assert all(condition.commands == {"apex": (0.065, 0.085)} for condition in shipped)
+    assert all(condition.goals == {"apex": (0.065, 0.085)} for condition in shipped)
     low, high = suite(
         tmp_path,
         dict(name="apex", unit="cm", strengths=[7, 9], terms={"apex": "strength"}),
         dict(name="only bounce", task="bounce", terms={"target_height": 0.5}),
         trained=dribble,
     )
-    assert [c.commands["apex"][0] for c in (low, high)] == pytest.approx([0.07, 0.09])
+    assert [c.goals["apex"][0] for c in (low, high)] == pytest.approx([0.07, 0.09])
     assert [c.trained for c in (low, high)] == [True, False]
     with pytest.raises(UserError, match="unknown key randomization.target_height; "):
         suite(tmp_path, dict(name="target", terms={"target_height": 0.5}), trained=dribble)

@@ -28,19 +28,19 @@ from bounce_mjx.robot.model import fingerprint, load_model
 from bounce_mjx.runs import folders
 from bounce_mjx.runs import presets as presets_module
 from bounce_mjx.runs.config import TrainConfig, load_run_config
-from bounce_mjx.runs.files import to_json
 from bounce_mjx.runs.folders import (
     best_checkpoint,
     choose_checkpoint,
     create_run,
     find_checkpoint,
     latest_checkpoint,
-    named_run,
+    run_or_newest,
     save_config,
 )
+from bounce_mjx.runs.layers import read_preset
 from bounce_mjx.runs.presets import preset_files
 from bounce_mjx.runs.progress import Progress, load_results
-from bounce_mjx.runs.settings import read_preset
+from bounce_mjx.runs.storage import to_json
 from bounce_mjx.task import Proportional
 from bounce_mjx.training import run as training_run
 from bounce_mjx.world.config import ActionConfig
@@ -129,11 +129,11 @@ def test_the_newest_run_is_introduced(runs: Path, name: Path | None, capsys) -> 
 
 def test_latest_is_a_name_for_every_command(runs: Path, monkeypatch) -> None:
     monkeypatch.chdir(runs)
-    assert named_run(Path("latest"), runs) == named_run(None, runs) == runs / "2026-01-02"
+    assert run_or_newest(Path("latest"), runs) == run_or_newest(None, runs) == runs / "2026-01-02"
     command = train_command.read_command(["latest", "--log-dir", str(runs)])
     assert command.layers.start.run == runs / "2026-01-02"
     (runs / "latest").mkdir()
-    assert named_run(Path("latest"), runs) == Path("latest")
+    assert run_or_newest(Path("latest"), runs) == Path("latest")
 
 
 def test_the_newest_run_is_not_the_greatest_name(tmp_path: Path) -> None:
@@ -144,8 +144,8 @@ def test_the_newest_run_is_not_the_greatest_name(tmp_path: Path) -> None:
         (tmp_path / name / "checkpoints/64").mkdir(parents=True)
         save_config(tmp_path / name, TrainConfig())
     while names:
-        assert named_run(None, tmp_path).name == names.pop()
-        shutil.rmtree(named_run(None, tmp_path))
+        assert run_or_newest(None, tmp_path).name == names.pop()
+        shutil.rmtree(run_or_newest(None, tmp_path))
 
 
 def test_a_run_is_opened_by_its_path_and_reads_its_policy_once(trained: Path, monkeypatch) -> None:

@@ -22,7 +22,7 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.runs import presets
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.folders import create_run, pretrained_checkpoint
-from bounce_mjx.runs.settings import Choice, read_layers, read_preset
+from bounce_mjx.runs.layers import Choice, read_layers, read_preset
 from bounce_mjx.training import job
 from bounce_mjx.training.command import read_command
 from bounce_mjx.training.run import notes_on_intervals, notes_on_starts, notes_on_worlds
@@ -355,7 +355,7 @@ def test_the_source_is_what_set_the_value_that_counts(folder: Path) -> None:
     config = read_command("track --warm-start track".split()).config
     assert config.sources["task"] == "flags"
     (folder / "world.yaml").write_text(
-        "env: {randomization: {command_interval: [2.0, 4.0]}}\nsources: {randomization: A test.}"
+        "env: {randomization: {goal_interval: [2.0, 4.0]}}\nsources: {randomization: A test.}"
     )
     # A flag has a part of a mapping that lies first in the preset's, which a file continues.
     (folder / "shares.yaml").write_text(

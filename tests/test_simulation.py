@@ -1,4 +1,4 @@
-"""The viewers' simulation: its frames, commands, pushes, worlds, clock and markers."""
+"""The viewers' simulation: its frames, goals, pushes, worlds, clock and markers."""
 
 import itertools
 import re
@@ -71,7 +71,7 @@ def test_frames_describe_one_state(env: BounceBall, recording: EnvFrame) -> None
     display = Display(env)
     for step in (0, 57, 123):
         for i in range(2):
-            display.pose(recording.qpos[step, i], at_index(frame_at(recording, step).command, i))
+            display.pose(recording.qpos[step, i], at_index(frame_at(recording, step).goal, i))
             geom = display.data.geom
             np.testing.assert_allclose(geom("ball").xpos, recording.balls[step, i, 0], atol=1e-6)
             np.testing.assert_allclose(geom("blocker").xpos, recording.paddle[step, i], atol=1e-5)
@@ -93,12 +93,12 @@ def test_the_target_height_can_be_set_and_stays(mirrored: Simulation) -> None:
     """It is seen before the next step, as while the page is paused, and after a reset."""
     mirrored.reset()
     drawn = target_of(mirrored.frame)
-    mirrored.command = at_height(0.77)
+    mirrored.goal = at_height(0.77)
     assert np.all(drawn != np.float32(0.77))
     for advance in (lambda: None, mirrored.step, mirrored.reset, mirrored.step):
         advance()
         np.testing.assert_allclose(target_of(mirrored.frame), 0.77)
-    mirrored.command = {}
+    mirrored.goal = {}
     mirrored.reset()
     low, high = mirrored.env.config.target_height_range
     target = target_of(mirrored.step())
@@ -155,7 +155,7 @@ def test_policies_of_different_tasks_are_not_shown_together() -> None:
     shown = [show.Shown(config(), None, "") for config in (LeanConfig, StillConfig)]
     options = ViewerOptions(viewer="browser")
     with pytest.raises(UserError, match="different tasks; show one at a time"):
-        show.show(shown, options, commands={}, console=Console())
+        show.show(shown, options, goals={}, console=Console())
 
 
 NOMINAL = {slider.term: slider.world_value(slider.nominal) for slider in SLIDERS}

@@ -18,9 +18,9 @@ import pytest
 import rest_task
 from bounce_mjx import load_policy, task
 from bounce_mjx.commands.eval import EvalCommand
+from bounce_mjx.commands.goals import parse_with_goals
 from bounce_mjx.commands.main import main
 from bounce_mjx.commands.play import PlayCommand
-from bounce_mjx.commands.task_commands import parse_with_commands
 from bounce_mjx.config import user_code
 from bounce_mjx.config.files import dump_config
 from bounce_mjx.config.user_code import import_code
@@ -31,9 +31,9 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.learning.metrics import rollout_metrics, step_metrics
 from bounce_mjx.runs import checkpoints
 from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig, load_run_config
-from bounce_mjx.runs.files import seal
 from bounce_mjx.runs.folders import create_run, find_checkpoint
-from bounce_mjx.runs.settings import read_preset
+from bounce_mjx.runs.layers import read_preset
+from bounce_mjx.runs.storage import seal
 from bounce_mjx.task import paths, registry
 from bounce_mjx.task.registry import find_task, task_name
 from bounce_mjx.training.command import read_command
@@ -55,7 +55,7 @@ RESULT = r"rests +episodes"
 def test_a_task_without_events_goes_through_every_command(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """It has no command, event, curve, marker or plot."""
+    """It has no goal, event, curve, marker or plot."""
     monkeypatch.chdir(tmp_path)
 
     def command(*args: str, code: int = 0) -> str:
@@ -93,23 +93,23 @@ def test_a_task_without_events_goes_through_every_command(
     assert policy.step({name: measured[name] for name in policy.needs}).shape == (6,)
 
 
-def test_a_command_that_the_policy_does_not_see_is_refused() -> None:
+def test_a_goal_that_the_policy_does_not_see_is_refused() -> None:
     bounce = find_task("bounce").Config
     unseen = {"target_height": 0}
-    with pytest.raises(UserError, match="not see the command target_height, which varies from 0.4"):
+    with pytest.raises(UserError, match="not see the goal target_height, which varies from 0.4"):
         Env(bounce(observation=unseen))
     # A fixed one, or one that a quantity of the task may show.
     Env(bounce(observation=unseen, target_height_range=(0.5, 0.5)))
     Env(bounce(observation=unseen | {"apex_error": 1}))
 
     class Config(bounce):
-        """A command with the name of a setting that shows nothing."""
+        """A goal with the name of a setting that shows nothing."""
 
         @property
-        def commands(self) -> dict[str, task.Command]:
-            return {"velocity": task.Command(0.0, 1.0)}
+        def goals(self) -> dict[str, task.Goal]:
+            return {"velocity": task.Goal(0.0, 1.0)}
 
-    with pytest.raises(UserError, match="not see the command velocity, which varies from 0 to 1"):
+    with pytest.raises(UserError, match="not see the goal velocity, which varies from 0 to 1"):
         Env(Config())
 
 
@@ -118,16 +118,16 @@ def test_a_command_that_the_policy_does_not_see_is_refused() -> None:
     [
         ("ball_mass", "a term of the randomisation"),
         ("joint_angles", "a measurement"),
-        ("apex_error", "a quantity of the task; choose .* give the quantity the group command"),
+        ("apex_error", "a quantity of the task; choose .* give the quantity the group goal"),
     ],
 )
-def test_a_command_with_the_name_of_something_else_is_refused(name, kind) -> None:
+def test_a_goal_with_the_name_of_something_else_is_refused(name, kind) -> None:
     class Config(find_task("bounce").Config):
         @property
-        def commands(self) -> dict[str, task.Command]:
-            return {name: task.Command(0.0, 1.0, hidden=True)}
+        def goals(self) -> dict[str, task.Goal]:
+            return {name: task.Goal(0.0, 1.0, hidden=True)}
 
-    with pytest.raises(UserError, match=f"the command {name} has the name of {kind}"):
+    with pytest.raises(UserError, match=f"the goal {name} has the name of {kind}"):
         Env(Config())
 
 
@@ -181,7 +181,7 @@ class _Wrong(rest_task.Rest):
     """The tests give it a wrong method."""
 
     class Config(rest_task.Rest.Config):
-        commands: ClassVar = {"height": task.Command(0.4, 0.4)}
+        goals: ClassVar = {"height": task.Goal(0.4, 0.4)}
 
 
 @pytest.fixture(scope="module")
@@ -222,7 +222,7 @@ def test_a_step_that_returns_something_else_is_refused(
         jax.eval_shape(lambda key: wrong.reset(key), jax.random.key(0))
 
 
-COMMAND = r"of the task _Wrong \(test_tasks.py, line \d+\) returns"
+GOAL = r"of the task _Wrong \(test_tasks.py, line \d+\) returns"
 
 
 @pytest.mark.parametrize(
@@ -230,12 +230,12 @@ COMMAND = r"of the task _Wrong \(test_tasks.py, line \d+\) returns"
     [
         ("step", None, "step of the task _Wrong .* returns None; return a task.TaskStep"),
         ("reset", {"rose": False}, "returns a tuple for state; return a dict of the same struct"),
-        ("first_command", None, f"first_command {COMMAND} None; return a dictionary"),
-        ("first_command", {"height": jnp.ones(1)}, r"float32 of the shape \(1,\) for \['height'\]"),
-        ("next_command", {"height": jnp.ones(1)}, rf"next_command {COMMAND} .* for \['height'\];"),
-        ("next_command", {"height": 1}, rf"next_command {COMMAND} a int for \['height'\]; return"),
-        ("next_command", {"height": jnp.int32(1)}, f"{COMMAND} int32 .* of a floating-point type"),
-        ("throw", np.zeros(3), rf"throw {COMMAND} float64 of the shape \(3,\); return the pos"),
+        ("first_goal", None, f"first_goal {GOAL} None; return a dictionary"),
+        ("first_goal", {"height": jnp.ones(1)}, r"float32 of the shape \(1,\) for \['height'\]"),
+        ("next_goal", {"height": jnp.ones(1)}, rf"next_goal {GOAL} .* for \['height'\];"),
+        ("next_goal", {"height": 1}, rf"next_goal {GOAL} a int for \['height'\]; return"),
+        ("next_goal", {"height": jnp.int32(1)}, f"{GOAL} int32 .* of a floating-point type"),
+        ("throw", np.zeros(3), rf"throw {GOAL} float64 of the shape \(3,\); return the pos"),
         ("throw", (np.zeros(2), np.zeros(3)), r"a tuple of the shapes \(2,\), \(3,\); return"),
     ],
 )
@@ -289,7 +289,7 @@ def test_a_tally_that_is_not_numbers_is_refused(
         ),
         (
             "step",
-            lambda task, state, step: step.command["hieght"],
+            lambda task, state, step: step.goal["hieght"],
             r"_Wrong \(test_tasks.py, line \d+\) ends in KeyError: 'hieght' \(did you mean",
         ),
         (
@@ -330,7 +330,7 @@ COMMON_MISTAKES = {
         "step.truth.ball_velocty[2]",
         "AttributeError: .* mean ball_velocity",
     ),
-    "a name": ('step.command["apex"]', 'step.command["apx"]', "KeyError: 'apx' .did you mean apex"),
+    "a name": ('step.goal["apex"]', 'step.goal["apx"]', "KeyError: 'apx' .did you mean apex"),
     "an if": (
         "is_low = ",
         "low = 1 if height > 0 else 0\n        is_low = ",
@@ -350,16 +350,16 @@ COMMON_MISTAKES = {
         "TypeError: add got",
     ),
     "a curve": ('"apex_error", "apexes"', '"apex_eror", "apexes"', "a metric that .* apex_eror"),
-    "an order": ("Command(low, high", "Command(high, low", "from 0.085 to 0.065; give two finite"),
+    "an order": ("Goal(low, high", "Goal(high, low", "from 0.085 to 0.065; give two finite"),
     "a group": (
-        ', "command")] = 1',
+        ', "goal")] = 1',
         ")] = 1",
-        "the name of a quantity of the task; .* the group com",
+        "the name of a quantity of the task; .* the group goal",
     ),
     "an unseen": (
         "apex: Annotated[",
         "apx: Annotated[",
-        "policy does not see the command apex, wh",
+        "policy does not see the goal apex, wh",
     ),
     "a tally": ("return task.Tally(sums)", "return sums", "tally .* a dict; return a task.Tally"),
     "a sum": (
@@ -378,6 +378,18 @@ COMMON_MISTAKES = {
         "there is no task 'dribble' .*; did you mean drible?",
     ),
     "a config": ("    Config = Config\n", "", "Dribble has no Config of its own"),
+    "an old field": ('step.goal["apex"]', 'step.command["apex"]', "AttributeError.* mean goal"),
+    "an old type": (
+        "task.Goal(low",
+        "task.Command(low",
+        r"the goals \(mine.py, line 79\) end in .* 'Command' \(did you mean Goal",
+    ),
+    "an old method": ("def goals(", "def commands(", "Dribble has commands, which is goals today"),
+    "an old import": (
+        "from bounce_mjx import task",
+        "from bounce_mjx import task\nfrom bounce_mjx.task.bounce import BounceConfig",
+        "in line 10: cannot import name 'BounceConfig' .*did you mean Config",
+    ),
     "an import": (
         "import jax.numpy as jnp",
         "import jax.numpi as jnp",
@@ -407,7 +419,7 @@ def test_a_common_mistake_in_a_task_is_one_sentence(mistake: str, tmp_path: Path
 
     with pytest.raises(UserError, match=words) as refused:
         trace()
-    about_a_value = ("a curve", "a group", "an unseen", "a class", "a config")
+    about_a_value = ("a curve", "a group", "an unseen", "a class", "a config", "an old method")
     assert ("line " in str(refused.value)) == (mistake not in about_a_value)
 
 
@@ -485,23 +497,23 @@ def test_an_attribute_of_another_type_is_refused(
         ({"low": 0.0, "high": 1.0, "names": ("1",)}, "the names .'1',.; give a tuple of names, of"),
     ],
 )
-def test_a_command_from_which_nothing_can_be_sampled_is_refused(settings: dict, words: str) -> None:
+def test_a_goal_from_which_nothing_can_be_sampled_is_refused(settings: dict, words: str) -> None:
     """Where it is written, with its line."""
-    with pytest.raises(UserError, match=rf"a command( \(test_tasks.py, line \d+\))?:? .*{words}"):
-        task.Command(**settings)
+    with pytest.raises(UserError, match=rf"a goal( \(test_tasks.py, line \d+\))?:? .*{words}"):
+        task.Goal(**settings)
 
 
 @pytest.mark.parametrize(
-    ("commands", "words"),
+    ("goals", "words"),
     [
-        ({"height": (0.4, 0.5)}, r"the command height .* is \(0.4, 0.5\); give a task.Command"),
-        ([task.Command(0.4, 0.5)], "the commands of .* _Wrong are .*; return a dictionary of a"),
+        ({"height": (0.4, 0.5)}, r"the goal height .* is \(0.4, 0.5\); give a task.Goal"),
+        ([task.Goal(0.4, 0.5)], "the goals of .* _Wrong are .*; return a dictionary of a"),
     ],
 )
-def test_commands_of_another_type_are_refused(
-    commands: object, words: str, wrong: Env, monkeypatch: pytest.MonkeyPatch
+def test_goals_of_another_type_are_refused(
+    goals: object, words: str, wrong: Env, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(_Wrong.Config, "commands", commands)
+    monkeypatch.setattr(_Wrong.Config, "goals", goals)
     with pytest.raises(UserError, match=words):
         Env(wrong.config)
 
@@ -509,23 +521,23 @@ def test_commands_of_another_type_are_refused(
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        ((2, "m", "command"), r"shows a command, which is one number; give task.Quantity\(1, 'm'"),
-        ((None, "", "command"), "shows a command, which is one number"),
-        ((1, "m", "command", True), "shows a command, which is one number"),
-        ((1, "m", "commands"), "has the group 'commands'; choose from state, command, past, task"),
+        ((2, "m", "goal"), r"shows a goal, which is one number; give task.Quantity\(1, 'm'"),
+        ((None, "", "goal"), "shows a goal, which is one number"),
+        ((1, "m", "goal", True), "shows a goal, which is one number"),
+        ((1, "m", "goals"), "has the group 'goals'; choose from state, goal, past, task"),
         ((0, "m"), "has the size 0; give a number of entries, or None for one of each joint"),
         ((1.5, "m"), "has the size 1.5; give a number of entries"),
     ],
 )
 def test_a_quantity_that_cannot_be_is_refused(settings: tuple, words: str) -> None:
-    """Where it is written. Of a larger size, the observation would repeat a command."""
+    """Where it is written. Of a larger size, the observation would repeat a goal."""
     with pytest.raises(
         UserError, match=rf"Quantity\(size=.*\) \(test_tasks.py, line \d+\) {words}"
     ):
         task.Quantity(*settings)
 
 
-def test_a_command_is_not_shown_by_a_quantity_of_another_group(wrong: Env) -> None:
+def test_a_goal_is_not_shown_by_a_quantity_of_another_group(wrong: Env) -> None:
     class Seen(task.ObservationConfig):
         height: Annotated[int, task.Quantity(1, "m")] = 1
 
@@ -548,11 +560,11 @@ def test_a_curve_that_cannot_be_is_refused(settings: tuple, words: str) -> None:
         task.Curve(*settings)
 
 
-def test_a_command_that_is_shown_but_not_there_is_refused(wrong: Env) -> None:
+def test_a_goal_that_is_shown_but_not_there_is_refused(wrong: Env) -> None:
     class Seen(task.ObservationConfig):
-        heigth: Annotated[int, task.Quantity(1, "m", "command")] = 1
+        heigth: Annotated[int, task.Quantity(1, "m", "goal")] = 1
 
-    with pytest.raises(UserError, match="the command heigth, which there is not; .*: height"):
+    with pytest.raises(UserError, match="the goal heigth, which there is not; .*: height"):
         Env(wrong.config.model_copy(update={"observation": Seen()}))
 
 
@@ -616,9 +628,9 @@ def test_a_task_returns_the_quantities_of_its_observation(
         jax.eval_shape(reset_and_step, jax.random.key(0))
 
 
-def test_commands_are_observed_in_one_order() -> None:
+def test_goals_are_observed_in_one_order() -> None:
     """Not in that of a set, which differs between processes: each would compile its own program."""
-    values = {f"command_{i}": jnp.zeros(()) for i in range(8)}
+    values = {f"goal_{i}": jnp.zeros(()) for i in range(8)}
     histories = {name: jnp.zeros((2, 1)) for name in values}
     env = object.__new__(Env)
     env.layout = ObservationLayout(tuple(Part(name, 1, "", 2) for name in values))
@@ -687,13 +699,13 @@ def test_tasks_have_the_geometry_of_the_model(large: Path) -> None:
     [
         (
             "catch",
-            {"randomization": {"command_interval": (1.0, 2.0)}},
-            "randomization.command_interval is given, but the task Catch has no commands; leave",
+            {"randomization": {"goal_interval": (1.0, 2.0)}},
+            "randomization.goal_interval is given, but the task Catch has no goals; leave",
         ),
         (
             "catch",
-            {"randomization": {"first_command_range": 0.5, "warmup_steps": 10}},
-            "randomization.first_command_range is given, but the task Catch has no commands",
+            {"randomization": {"first_goal_range": 0.5, "warmup_steps": 10}},
+            "randomization.first_goal_range is given, but the task Catch has no goals",
         ),
         ("bounce", {"target_height_range": 0.5}, "0.5 is not a range; give two numbers"),
         ("track", {"speed_range": (0.1,)}, r"\(0.1,\) is not a range; give two numbers"),
@@ -724,12 +736,12 @@ def test_a_setting_that_a_task_cannot_have_is_refused(
 
 
 @pytest.mark.parametrize("name", ["juggle", "track"])
-def test_no_height_that_may_be_commanded_ends_the_episode_at_a_hit(name: str) -> None:
+def test_no_height_that_may_be_a_goal_ends_the_episode_at_a_hit(name: str) -> None:
     """A ball exactly in its column or under its point is not lost where the paddle hits it, at the
     greatest height that a flag or a slider may set; 5 cm more would end the episode."""
     kind = find_task(name)
     flown = kind(kind.Config())
-    command = flown.config.commands["target_height"]
+    goal = flown.config.goals["target_height"]
     # The point rises from the lowest place of its sway to the highest one.
     rise = 2.0 * paths.SWAY if name == "track" else 0.0
     rest = jnp.zeros(6)
@@ -742,19 +754,19 @@ def test_no_height_that_may_be_commanded_ends_the_episode_at_a_hit(name: str) ->
         if name == "track":
             balls = balls[0]
         truth = task.Kinematics(rest, balls, None, rest, 0.0 * balls, None, jnp.array(tops[0]))
-        middle = {name: jnp.float32(each.low) for name, each in flown.config.commands.items()}
+        middle = {name: jnp.float32(each.low) for name, each in flown.config.goals.items()}
         x, y, _ = flown.config.home
-        commands = middle | {"target_x": x, "target_y": y, "target_height": jnp.float32(height)}
-        state = flown.reset(task.Start(truth, commands, jnp.zeros(0)))
-        return bool(flown.step(state, task.Step(truth, commands, rest, rest)).ended)
+        goals = middle | {"target_x": x, "target_y": y, "target_height": jnp.float32(height)}
+        state = flown.reset(task.Start(truth, goals, jnp.zeros(0)))
+        return bool(flown.step(state, task.Step(truth, goals, rest, rest)).ended)
 
-    assert not is_ended(command.greatest + rise) and is_ended(command.greatest + rise + 0.05)
-    lowest, highest = command.offered
-    assert command.least <= lowest and highest <= command.greatest
-    for height in (command.least - 1e-3, command.greatest + 1e-3):
+    assert not is_ended(goal.greatest + rise) and is_ended(goal.greatest + rise + 0.05)
+    lowest, highest = goal.offered
+    assert goal.least <= lowest and highest <= goal.greatest
+    for height in (goal.least - 1e-3, goal.greatest + 1e-3):
         with pytest.raises(UserError, match="target_height is .* but must be a finite number >= "):
-            command.checked(height, "target_height")
-    with pytest.raises(ValueError, match="height_range: a command .* farther than max_distance"):
+            goal.checked(height, "target_height")
+    with pytest.raises(ValueError, match="height_range: a goal .* farther than max_distance"):
         kind.Config(height_range=(0.72, 0.75))
 
 
@@ -987,12 +999,12 @@ def test_a_package_can_have_tasks(
     # A policy of another task is evaluated all the same, also where the code itself is wrong.
     (tmp_path / "wrong.py").write_text("undefined")
     (info / "entry_points.txt").write_text(f"[{registry.GROUP}]\nbad = wrong:Task\n")
-    command, _ = parse_with_commands(EvalCommand, ["robust"], prog="bounce-mjx eval")
+    command, _ = parse_with_goals(EvalCommand, ["robust"], prog="bounce-mjx eval")
     assert command.checkpoint == Path("robust")
     said = capsys.readouterr().err
     assert "warning: the task bad cannot be imported (name 'undefined' is not defined)" in said
     with pytest.raises(UserError, match="the task bad cannot be imported"):
-        parse_with_commands(EvalCommand, ["--task", "bad"], prog="bounce-mjx eval")
+        parse_with_goals(EvalCommand, ["--task", "bad"], prog="bounce-mjx eval")
     for attribute in ("Config", "__name__", "task.Task"):
         (info / "entry_points.txt").write_text(f"[{registry.GROUP}]\nno = my_tasks:{attribute}\n")
         words = "cannot be imported" if "." in attribute else "is no subclass of Task; correct the"
@@ -1020,7 +1032,7 @@ def test_a_robot_serves_another_task() -> None:
     assert config.mjcf == bounce.mjcf and config.robot == bounce.robot
     assert config.default_joint_angles == bounce.default_joint_angles
     # A viewer offers targets over the paddle, as far as over that of the package's own arm.
-    lowest, highest = bounce.commands["target_height"].span
+    lowest, highest = bounce.goals["target_height"].span
     assert (lowest, highest) == pytest.approx(
         np.add(bounce.reward.paddle_home_height, (0.25, 0.75))
     )
@@ -1042,13 +1054,13 @@ class Sized(rest_task.Rest):
         \"\"\"A setting whose name another setting has.\"\"\"
 
         @property
-        def commands(self):
+        def goals(self):
             names = "size", "zoom", "episodes", "copy", "help", "model_config", "depth"
-            return {name: task.Command(0.0, 1.0) for name in names}
+            return {name: task.Goal(0.0, 1.0) for name in names}
 """
 
 
-def test_a_task_may_name_a_command_or_a_setting_like_a_flag(
+def test_a_task_may_name_a_goal_or_a_setting_like_a_flag(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The flag that stands in no group stays, and the other one has its group."""
@@ -1056,12 +1068,12 @@ def test_a_task_may_name_a_command_or_a_setting_like_a_flag(
     import_code(tmp_path / "sized.py")
     task_flag = ["--task", "sized"]
     env = find_task("sized").Config()
-    flags = "--commands.size 0.5 --size 64 64 --copy 0.25 --commands.help 1 --depth 1".split()
-    command, given = parse_with_commands(PlayCommand, [*task_flag, *flags], prog="play")
+    flags = "--goals.size 0.5 --size 64 64 --copy 0.25 --goals.help 1 --depth 1".split()
+    command, given = parse_with_goals(PlayCommand, [*task_flag, *flags], prog="play")
     assert command.viewing.size == (64, 64)
     assert given.checked(env) == {"size": 0.5, "copy": 0.25, "help": 1.0, "depth": 1.0}
-    flags = "--episodes 7 --commands.episodes 0.5 --model-config 1 --size 0.1".split()
-    command, given = parse_with_commands(EvalCommand, [*task_flag, *flags], prog="eval")
+    flags = "--episodes 7 --goals.episodes 0.5 --model-config 1 --size 0.1".split()
+    command, given = parse_with_goals(EvalCommand, [*task_flag, *flags], prog="eval")
     assert command.episodes == 7
     assert given.checked(env) == {"episodes": 0.5, "model_config": 1.0, "size": 0.1}
     flags = "--no-report --env.report 0.25 --seed 8 --env.seed 9".split()
@@ -1072,10 +1084,10 @@ def test_a_task_may_name_a_command_or_a_setting_like_a_flag(
 
 class _Rising(rest_task.Rest):
     class Config(rest_task.Rest.Config):
-        commands: ClassVar = {"height": task.Command(0.4, 0.4)}
+        goals: ClassVar = {"height": task.Goal(0.4, 0.4)}
 
-    def next_command(self, state: tuple, command: task.Values) -> task.Values:
-        return {"height": command["height"] + 0.01}
+    def next_goal(self, state: tuple, goal: task.Values) -> task.Values:
+        return {"height": goal["height"] + 0.01}
 
 
 def test_the_log_has_each_metric_of_a_task() -> None:
@@ -1095,11 +1107,11 @@ def test_the_log_has_each_metric_of_a_task() -> None:
 
 
 @pytest.mark.slow
-def test_a_task_moves_its_commands() -> None:
+def test_a_task_moves_its_goals() -> None:
     env = Env(_Rising.Config())
     step, state = jax.jit(env.step), jax.jit(env.reset)(jax.random.PRNGKey(0))
     for count in range(3):
-        np.testing.assert_allclose(state.pipeline_state.command["height"], 0.41 + 0.01 * count)
+        np.testing.assert_allclose(state.pipeline_state.goal["height"], 0.41 + 0.01 * count)
         state = step(state, jnp.zeros(6))
 
 

@@ -126,7 +126,7 @@ def test_clock_is_a_copy(env):
 
 def test_a_warm_up_goes_on_through_the_resets_of_a_training():
     """skrl resets a single environment after each episode; only a seed begins anew."""
-    growing = {"first_command_range": 0.01, "warmup_steps": NUM_ENVS * 5}
+    growing = {"first_goal_range": 0.01, "warmup_steps": NUM_ENVS * 5}
     config = EnvConfig(physics="fused", target_height_range=(0.5, 0.9), randomization=growing)
     env = TorchVectorEnv(BounceBall(config), NUM_ENVS)
 

@@ -16,11 +16,11 @@ from bounce_mjx.world.randomization import RandomizationConfig
 CONFIG = Config()
 TRACK = Track(CONFIG)
 SIZE, DT = CONFIG.path_size, CONFIG.control_dt
-INTERVAL = RandomizationConfig(command_interval=(0.5, 0.5))
+INTERVAL = RandomizationConfig(goal_interval=(0.5, 0.5))
 NOT_STEPS = [i for i in range(len(paths.NAMES)) if i != paths.STEPS]
 
 
-def command(path: float = 0, speed: float = 0.3, course: float = 0.2, phase: float = 0.4) -> dict:
+def goal(path: float = 0, speed: float = 0.3, course: float = 0.2, phase: float = 0.4) -> dict:
     values = {"target_x": 0.6, "target_y": 0.1, "target_height": 0.5, "point_speed": speed}
     values |= {"path": path, "course": course, "phase": phase}
     return {name: jnp.float32(value) for name, value in values.items()}
@@ -28,13 +28,13 @@ def command(path: float = 0, speed: float = 0.3, course: float = 0.2, phase: flo
 
 @partial(jax.jit, static_argnums=1)
 def followed(start: dict, steps: int) -> jax.Array:
-    """The point [steps, 3] of an episode that starts with drawn commands."""
+    """The point [steps, 3] of an episode that starts with drawn goals."""
 
     def advance(now, _):
-        now = TRACK.next_command(jnp.array(True), now)
+        now = TRACK.next_goal(jnp.array(True), now)
         return now, paths.point(now)
 
-    return jax.lax.scan(advance, TRACK.first_command(start), None, steps)[1]
+    return jax.lax.scan(advance, TRACK.first_goal(start), None, steps)[1]
 
 
 def from_middle(start: dict, seconds: float) -> np.ndarray:
@@ -46,18 +46,18 @@ def from_middle(start: dict, seconds: float) -> np.ndarray:
 
 def test_the_paths_are_their_equations() -> None:
     """Of a circle, a line, and the lemniscate of Gerono, each over more than one turn."""
-    x, y = from_middle(command(0), 4.0)
+    x, y = from_middle(goal(0), 4.0)
     np.testing.assert_allclose(np.hypot(x, y), SIZE, atol=1e-5)
-    x, y = from_middle(command(1), 4.0)
+    x, y = from_middle(goal(1), 4.0)
     np.testing.assert_allclose(y, 0.0, atol=1e-5)
     np.testing.assert_allclose((x.min(), x.max()), (-SIZE, SIZE), atol=1e-4)
-    x, y = from_middle(command(2), 6.0)
+    x, y = from_middle(goal(2), 6.0)
     np.testing.assert_allclose(y**2, x**2 * (1.0 - (x / SIZE) ** 2), atol=1e-6)
     np.testing.assert_allclose((x.min(), x.max()), (-SIZE, SIZE), atol=1e-4)
 
 
 def test_the_point_steps_by_10_cm_every_4_s() -> None:
-    way = np.linalg.norm(np.diff(np.asarray(followed(command(3), 2000))[:, :2], axis=0), axis=1)
+    way = np.linalg.norm(np.diff(np.asarray(followed(goal(3), 2000))[:, :2], axis=0), axis=1)
     (steps,) = np.nonzero(way > 1e-4)
     np.testing.assert_allclose(way[steps], 0.1, atol=1e-5)
     np.testing.assert_allclose(np.diff(steps), 400, atol=1)
@@ -69,7 +69,7 @@ def test_the_point_steps_by_10_cm_every_4_s() -> None:
 def test_the_point_is_at_most_as_fast_as_commanded(path: int, speed: float) -> None:
     """In any course; the courses of the wandering differ in their greatest speed."""
     courses = np.linspace(0.0, 1.0, 50, endpoint=False)
-    starts = jax.vmap(lambda course: command(path, speed) | {"course": course})(courses)
+    starts = jax.vmap(lambda course: goal(path, speed) | {"course": course})(courses)
     points = np.asarray(jax.vmap(lambda start: followed(start, 3000))(starts), float)
     fastest = np.linalg.norm(np.diff(points[..., :2], axis=1), axis=-1).max() / DT
     assert 0.9 * speed < fastest < 1.001 * speed
@@ -178,7 +178,7 @@ def test_every_sampled_path_has_its_middle_at_home() -> None:
 
         def pass_time(state, _):
             state = env.finish_step(state, jnp.zeros(6), actuation, physics)
-            now = state.pipeline_state.command
+            now = state.pipeline_state.goal
             return state, paths.point(now) - paths.offset(now, SIZE, now["phase"])
 
         return jax.lax.scan(pass_time, start, None, 500)[1]
@@ -197,7 +197,7 @@ def truth_of(ball: jax.Array, velocity: jax.Array, paddle: jax.Array) -> task.Ki
 
 def rewards_at(seconds: float, shift: float = 0.0, lift: float = 0.0) -> dict[str, float]:
     """Rewards of a flight whose apex is the point on a circle at that time."""
-    now = command(0)
+    now = goal(0)
     offset = paths.offset(now, SIZE, now["phase"])
     later = paths.offset(now, SIZE, paths.phase_in(seconds, now, SIZE))
     apex = paths.point(now) + later - offset + jnp.array([shift, 0.0, lift])
@@ -224,7 +224,7 @@ def test_rewards_are_greatest_without_an_error(seconds: float) -> None:
 
 def apex_metrics(ball: tuple[float, float, float]) -> task.TaskStep:
     truth = truth_of(jnp.array(ball), jnp.array([0.3, 0.0, -0.01]), jnp.array(CONFIG.home))
-    step = task.Step(truth, command(), jnp.zeros(6), jnp.zeros(6))
+    step = task.Step(truth, goal(), jnp.zeros(6), jnp.zeros(6))
     return TRACK.step(jnp.array(True), step)
 
 
@@ -237,7 +237,7 @@ def test_an_apex_is_measured_against_the_point_now() -> None:
 
 
 def figures(moments: list[tuple[dict, float, float, float]]) -> task.Episodes:
-    """One episode with an apex for each: its commands, error, height error, seconds."""
+    """One episode with an apex for each: its goals, error, height error, seconds."""
     tallies = []
     for now, error, height, seconds in moments:
         metrics = {"apexes": 1.0, "error": error, "height_error": height}
@@ -254,11 +254,11 @@ def figures(moments: list[tuple[dict, float, float, float]]) -> task.Episodes:
 
 def test_results_judge_apexes_by_path_and_speed() -> None:
     """Apexes of the first 2 s, and of the first second after a step, do not count."""
-    slow, fast, between = (command(0, speed) for speed in (0.1, 0.3, 0.2))
+    slow, fast, between = (goal(0, speed) for speed in (0.1, 0.3, 0.2))
     moments = [(slow, 0.01, 0.0, 5.0), (slow, 0.02, 0.0, 5.0), (slow, 1.0, 1.0, 1.9)]
     moments += [(fast, 0.05, 0.2, 5.0), (between, 1.0, 0.0, 5.0)]
     for corner, error in ((0.2, 1.0), (0.3, 0.02), (0.9, 0.04)):
-        moments += [(command(3, 0.3, phase=corner / 6.0), error, 0.0, 9.0)]
+        moments += [(goal(3, 0.3, phase=corner / 6.0), error, 0.0, 9.0)]
     found = {result.name: result for result in TRACK.results(figures(moments))}
     np.testing.assert_allclose(found["slow error"].value, np.sqrt(2.5), rtol=1e-5)
     np.testing.assert_allclose(found["fast error"].value, 5.0, rtol=1e-5)

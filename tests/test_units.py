@@ -15,7 +15,7 @@ from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.training.faults import first_block_fault
-from bounce_mjx.world.config import Command
+from bounce_mjx.world.config import Goal
 
 WRONG = """
 default_joint_angles: [0, 40, 110, 0, -60, 0]            # degrees
@@ -55,7 +55,7 @@ randomization: {ball_mass: [0.0027, 0.003]}              # kg, where a factor is
 randomization: {armature: [0.001, 0.002]}                # kg m^2, where a factor is due
 randomization: {servo_gain: [1000, 1001]}                # N m/rad, where a factor is due
 randomization: {servo_damping: [0.001, 0.002]}           # where a factor is due
-randomization: {command_interval: [0.01, 0.02]}          # one control step
+randomization: {goal_interval: [0.01, 0.02]}          # one control step
 action: {base: target, max_lead: 0.001}                  # less than an action moves
 action: {max_lead: 0.3}                                  # does nothing with the base measured
 randomization: {push_interval: [1, 2]}                   # does nothing without push_speed
@@ -94,7 +94,7 @@ randomization: {link_mass: [90, 110]}                    # %
 randomization: {ball_radius: [95, 105]}                  # %
 randomization: {ball_start: [-30, 30]}                   # mm
 randomization: {joint_start: [-5, 5]}                    # degrees
-randomization: {command_interval: [3000, 4000]}          # ms
+randomization: {goal_interval: [3000, 4000]}          # ms
 default_joint_angles: [0, 0.111, 0.306, 0, -0.167, 0]    # turns
 target_height_range: [40, 60]                            # cm
 max_joint_velocity: true                                 # a switch is no number
@@ -159,7 +159,7 @@ randomization: {ball_mass: [2.7, 3]}                     # g: a factor, of a bal
 randomization: {servo_gain: [80, 120]}                   # %: a factor, of very stiff servos
 randomization: {camera_rate: [8, 33]}                    # ms: a slow camera
 randomization: {joint_angle_noise: [0, 0.03]}            # degrees: a coarse encoder
-randomization: {command_interval: [0.05, 0.1]}           # minutes: commands that hardly rest
+randomization: {goal_interval: [0.05, 0.1]}           # minutes: goals that hardly rest
 reset: {joint_velocities: 0.57}                          # degrees a second: a quick start
 """
 
@@ -226,8 +226,8 @@ class Mistyped(task.Task):
         reward: Reward = Reward()
 
         @property
-        def commands(self) -> dict[str, Command]:
-            return {"height": Command(0.4, 0.6, "m", hidden=True)}
+        def goals(self) -> dict[str, Goal]:
+            return {"height": Goal(0.4, 0.6, "m", hidden=True)}
 
     @property
     def curves(self) -> tuple[task.Curve, ...]:
@@ -236,12 +236,12 @@ class Mistyped(task.Task):
     def reset(self, start: task.Start) -> tuple[()]:
         return ()
 
-    def next_command(self, state: tuple[()], command: task.Values) -> task.Values:
+    def next_goal(self, state: tuple[()], goal: task.Values) -> task.Values:
         if self.wrong == "key left out":
             return {}
         if self.wrong == "key given":
-            return command | {"hieght": command["height"]}
-        return command
+            return goal | {"hieght": goal["height"]}
+        return goal
 
     def step(self, state: tuple[()], step: task.Step) -> task.TaskStep:
         low, slow = step.truth.ball_position[2], step.truth.ball_velocity[2]
@@ -255,8 +255,8 @@ class Mistyped(task.Task):
     "wrong, reason",
     {
         "curve": "the curve task/error names a metric that there is not, eror; there are: error",
-        "key given": "next_command of the task Mistyped .* names a command that .* not, hieght",
-        "key left out": "Mistyped .* lacks the command height; there are: height",
+        "key given": "next_goal of the task Mistyped .* names a goal that .* not, hieght",
+        "key left out": "Mistyped .* lacks the goal height; there are: height",
         "term": "names a term of the reward that there is not, slwo; there are: low, slow",
         "term left out": "weighted_terms lacks the term of the reward slow; there are: low, slow",
     }.items(),

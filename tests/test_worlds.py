@@ -9,20 +9,32 @@ import yaml
 from bounce_mjx.commands.train import read_command
 from bounce_mjx.config.settings import merged
 from bounce_mjx.config.validation import validate
+from bounce_mjx.deploy.environments import environment_config
 from bounce_mjx.deploy.export import policy_metadata
+from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
+from bounce_mjx.evaluation.config import EvaluationOptions
+from bounce_mjx.evaluation.policy_evaluation import setup_of
 from bounce_mjx.evaluation.suite import load_suite
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.config import LimitsConfig, RobotConfig
 from bounce_mjx.robot.model import add_balls, scene_spec
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.runs.settings import read_preset
-from bounce_mjx.runs.worlds import in_named_world, robot_in_world
+from bounce_mjx.runs.layers import read_preset
+from bounce_mjx.runs.worlds import (
+    env_of_task,
+    in_named_world,
+    in_sampled_world,
+    robot_in_world,
+    trained_in,
+)
+from bounce_mjx.task.bounce import Bounce
 from bounce_mjx.task.catch import Catch
+from bounce_mjx.task.registry import find_task
 from bounce_mjx.world.config import ActionConfig
 from bounce_mjx.world.model import model_nominals
 from bounce_mjx.world.named import read_world
-from bounce_mjx.world.randomization import TERMS
+from bounce_mjx.world.randomization import TERMS, RandomizationConfig
 
 TWICE = "twice the assumed, or half"
 NAMES = ("ur5e_rtde", "panda_fci", "iiwa_fri", "fast_servo")
@@ -234,3 +246,45 @@ def test_a_world_of_a_robot_brings_its_limits_to_a_policy() -> None:
     config = trained.model_copy(update={"env": trained.env.model_copy(update=measured)})
     with pytest.raises(UserError, match="ur5e_rtde.*action.base"):
         in_named_world(config.env, Path("ur5e_rtde"))
+
+
+def test_a_named_world_is_for_a_ball_on_the_paddle_too() -> None:
+    """How well a person drops a ball is nothing to one that lies on the paddle."""
+    for task, ball_start in (("balance", None), ("catch", (-0.03, 0.03))):
+        config = env_of_task(find_task(task), world="fast_servo")
+        Env(config)
+        assert config.randomization.ball_start == ball_start
+        assert config.randomization.action_latency is not None
+        trained = trained_in(find_task(task).Config(), "fast_servo")
+        assert trained.randomization.ball_start == ball_start
+
+
+class _Moving(Bounce):
+    """Bouncing at heights that change."""
+
+    class Config(Bounce.Config):
+        randomization: RandomizationConfig = RandomizationConfig(goal_interval=(3.0, 3.0))
+
+
+def test_how_often_a_task_samples_its_goals_is_no_part_of_a_world() -> None:
+    """Whatever replaces the world of its training."""
+    trained = _Moving.Config(randomization={"goal_interval": (3.0, 3.0), "air_drag": (0.0, 0.1)})
+    drag = RandomizationConfig(air_drag=(0.1, 0.1))
+    others = [
+        trained_in(trained, "nominal"),
+        trained_in(trained, "fast_servo"),
+        in_sampled_world(trained, drag),
+        environment_config(trained, "nominal"),
+        setup_of(trained, EvaluationOptions(nominal=True)).env.config,
+    ]
+    conditions = load_suite(resource_path("configs/robustness.yaml"), trained)
+    others += [condition.config for condition in conditions]
+    assert len(others) > 50
+    assert None not in [config.randomization.goal_interval for config in others]
+    assert others[1].randomization.action_latency and not others[0].randomization.air_drag
+    # The user's own interval of a training is no part of the task, as its ranges are not.
+    bounce = Bounce.Config(randomization={"goal_interval": (3.0, 3.0)})
+    assert trained_in(bounce, "nominal").randomization.goal_interval is None
+    # One value for all goals leaves nothing to sample again.
+    fixed = EvaluationOptions(nominal=True, goals={"target_height": 0.5})
+    assert setup_of(trained, fixed).env.config.randomization.goal_interval is None

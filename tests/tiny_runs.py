@@ -15,8 +15,8 @@ import numpy as np
 import orbax.checkpoint as ocp
 
 from bounce_mjx.commands import train as train_command
-from bounce_mjx.runs.files import MANIFEST_FILE, check_integrity
 from bounce_mjx.runs.folders import Checkpoint
+from bounce_mjx.runs.storage import MANIFEST_FILE, check_integrity
 
 TRAIN_SCRIPT = Path(__file__).parent.parent / "train_jax.py"
 STEPS = 256

@@ -41,7 +41,7 @@ def at_height(target: float) -> dict[str, float]:
 
 
 def target_of(frame: EnvFrame) -> np.ndarray:
-    return frame.command["target_height"]
+    return frame.goal["target_height"]
 
 
 @functools.cache
@@ -55,7 +55,7 @@ def exchangeable() -> Simulation:
     """Two robots under a policy that is one constant action for all joints, from a new reset with
     the policy 0, whatever another file's tests left."""
     simulation = _exchangeable()
-    simulation.command, simulation.world, simulation.policy = {}, None, np.float32(0.0)
+    simulation.goal, simulation.world, simulation.policy = {}, None, np.float32(0.0)
     simulation.reset()
     return simulation
 
@@ -81,7 +81,7 @@ def recording_of(simulation: Simulation, steps: int, lasted: bool = True) -> Rec
         joint_angles=None,
         ball=None,
         paddle=frames.paddle[1:, :1].transpose(0, 2, 1),
-        command={name: values[1:, :1] for name, values in frames.command.items()},
+        goal={name: values[1:, :1] for name, values in frames.goal.items()},
         running=np.ones((steps, 1), bool),
         terminated=terminated,
         qpos=frames.qpos[1:, :1].transpose(0, 2, 1),
@@ -234,7 +234,7 @@ CAMERA = {
 
 
 class StillConfig(WorldConfig):
-    """A task without commands."""
+    """A task without goals."""
 
 
 class Still(task.Task):
@@ -249,15 +249,13 @@ class Still(task.Task):
 
 
 class LeanConfig(WorldConfig):
-    """A command that may be negative, a fixed one without a unit, and a choice."""
+    """A goal that may be negative, a fixed one without a unit, and a choice."""
 
     @property
-    def commands(self) -> dict[str, task.Command]:
-        angle = task.Command(-0.2, 0.2, "rad", least=-0.3, greatest=0.3, step=0.1, hidden=True)
-        pace = task.Command(2.0, 2.0, span=(1.0, 3.0), step=1.0)
-        gait = task.Command(
-            0.0, 2.0, "", 0.0, 2.0, step=1.0, names=("walk", "slow run"), hidden=True
-        )
+    def goals(self) -> dict[str, task.Goal]:
+        angle = task.Goal(-0.2, 0.2, "rad", least=-0.3, greatest=0.3, step=0.1, hidden=True)
+        pace = task.Goal(2.0, 2.0, span=(1.0, 3.0), step=1.0)
+        gait = task.Goal(0.0, 2.0, "", 0.0, 2.0, step=1.0, names=("walk", "slow run"), hidden=True)
         return {"lean_angle": angle, "pace": pace, "gait": gait}
 
 
@@ -265,20 +263,20 @@ class Lean(Still):
     Config = LeanConfig
 
     def step(self, state: tuple, step: task.Step) -> task.TaskStep:
-        twice = 2.0 * step.command["lean_angle"]
+        twice = 2.0 * step.goal["lean_angle"]
         return super().step(state, step)._replace(metrics={"twice": twice})
 
-    def markers(self, command: dict, metrics: dict) -> tuple[task.Marker, ...]:
-        place, size = (0.5, 0.0, 0.2 + command["lean_angle"]), (0.1, 0.1, 0.01)
+    def markers(self, goal: dict, metrics: dict) -> tuple[task.Marker, ...]:
+        place, size = (0.5, 0.0, 0.2 + goal["lean_angle"]), (0.1, 0.1, 0.01)
         wall = task.Marker("high_wall", place, size, (0.9, 0.1, 0.1, 1.0))
         dots = (task.Marker(f"dot {i}", (0.1 * i, 0.0, 0.5), size, (0, 0, 1, 1)) for i in range(3))
         return wall, *dots
 
-    def levels(self, command: dict[str, float]) -> dict[str, float]:
-        return {"shelf": 0.3, "wall": 0.2 + command["lean_angle"]}
+    def levels(self, goal: dict[str, float]) -> dict[str, float]:
+        return {"shelf": 0.3, "wall": 0.2 + goal["lean_angle"]}
 
-    def readings(self, command: dict[str, float], metrics: dict[str, float]) -> dict[str, str]:
-        return {"twice": f"{metrics['twice']:.1f}", "pace": f"{command['pace']:.0f}"}
+    def readings(self, goal: dict[str, float], metrics: dict[str, float]) -> dict[str, str]:
+        return {"twice": f"{metrics['twice']:.1f}", "pace": f"{goal['pace']:.0f}"}
 
 
 def evaluated(*passed: bool | None) -> Report:

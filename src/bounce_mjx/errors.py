@@ -143,11 +143,27 @@ def warn_once(sentence: str) -> None:
 
 
 def reason_of(error: Exception) -> str:
-    """An exception's text on one line, for a sentence; its type if it has no text."""
+    """An exception's text on one line, for a sentence, with the nearest name that there is of a
+    wrong one; its type if it has no text."""
     text = " ".join(str(error).split())
     # pydantic's text ends in a link to its own pages.
     text = re.sub(r" For further information visit \S+", "", text)
+    if near := _nearest_name(error):
+        # An ImportError ends with the module's place.
+        text = f"{text.partition(' (/')[0]} ({near})"
     return text or type(error).__name__
+
+
+def _nearest_name(error: Exception) -> str:
+    """A question about the name that a module or an object has in place of a wrong one; empty if
+    none is near."""
+    if isinstance(error, AttributeError) and error.name:
+        return suggest(error.name, dir(error.obj))
+    if isinstance(error, ImportError) and error.name in sys.modules:
+        # Python 3.12 has the name as `name_from`.
+        wrong = re.match(r"cannot import name '(\w+)'", str(error))
+        return suggest(wrong[1], dir(sys.modules[error.name])) if wrong else ""
+    return ""
 
 
 def shorten(text: str, length: int = 100) -> str:
@@ -155,7 +171,25 @@ def shorten(text: str, length: int = 100) -> str:
     return text if len(text) <= length else f"{text[: length - 3]}..."
 
 
+RENAMED = {
+    "BounceConfig": "Config",
+    "BounceObservation": "Observation",
+    "BounceReward": "Rewards",
+    "Command": "Goal",
+    "command": "goal",
+    "command_seconds": "goal_seconds",
+    "commands": "goals",
+    "first_command": "first_goal",
+    "next_command": "next_goal",
+}
+"""Today's names of what a task's file may have by another one."""
+
+
 def suggest(name: str, known: Iterable[str]) -> str:
-    """A question about the known name that is nearest to a mistaken one; empty if none is near."""
+    """A question about the known name that a mistaken one has today, or that is nearest to it;
+    empty if none is near."""
+    known = list(known)
+    if RENAMED.get(name) in known:
+        return f"did you mean {RENAMED[name]}?"
     near = difflib.get_close_matches(name, known, n=1)
     return f"did you mean {near[0]}?" if near else ""

@@ -23,7 +23,7 @@ from bounce_mjx.physics.parameters import MODEL_PARAMETERS, PhysicsParameters
 from bounce_mjx.physics.scalars import scalars_of
 from bounce_mjx.robot.model import find_addresses
 from bounce_mjx.robot.numbers import field_of
-from bounce_mjx.runs.settings import read_preset
+from bounce_mjx.runs.layers import read_preset
 from bounce_mjx.world.randomization import TERMS, RandomizationConfig
 from bounce_mjx.world.sampling import nominal_values, physics_parameters, sample_world
 

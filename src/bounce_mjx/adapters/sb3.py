@@ -115,7 +115,7 @@ class Sb3VecEnv(VecEnv):
         if hasattr(type(self), attr_name):
             raise UserError(
                 f"set_attr got {attr_name!r}, which is fixed by the settings; give these to "
-                "environment(...), and the commands of the next reset to set_options"
+                "environment(...), and the goals of the next reset to set_options"
             )
         setattr(self, attr_name, value)
 
@@ -160,12 +160,12 @@ class Sb3VecEnv(VecEnv):
         self, chosen: Iterable[int], seeds: Sequence[int | None], options: Sequence[dict[str, Any]]
     ) -> np.ndarray:
         mask = np.isin(np.arange(self.num_envs), list(chosen))
-        given = [self._batch.checked_commands(one) for one in options]
-        commands = {
+        given = [self._batch.checked_goals(one) for one in options]
+        goals = {
             name: np.array([one.get(name, np.nan) for one in given])
-            for name in self._batch.config.commands
+            for name in self._batch.config.goals
         }
-        return self._envs.restart(seeds, mask, commands)
+        return self._envs.restart(seeds, mask, goals)
 
     def _drawn(self, chosen: Iterable[int]) -> list[np.ndarray | None]:
         return [self._envs.draw(i) for i in chosen]

@@ -68,7 +68,7 @@ def _needs(config: WorldConfig) -> tuple[str, ...]:
 
 
 class MirrorLaw:
-    """The mirror law for an environment whose task commands a `target_height`."""
+    """The mirror law for an environment whose task has the goal `target_height`."""
 
     def __init__(self, env: Env):
         """Linearises the kinematics at the home pose.

@@ -54,7 +54,7 @@ def main(args: Sequence[str]) -> None:
     command = parse(AdoptCommand, args, prog="bounce-mjx adopt")
     from bounce_mjx.env.env import Env
     from bounce_mjx.robot.adopt import adopt
-    from bounce_mjx.runs.files import write_output
+    from bounce_mjx.runs.storage import write_output
     from bounce_mjx.training.setup import set_up_jax
 
     set_up_jax()

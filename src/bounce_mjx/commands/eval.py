@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
-from bounce_mjx.commands.task_commands import parse_with_commands
+from bounce_mjx.commands.goals import parse_with_goals
 from bounce_mjx.commands.which_policy import (
     MirrorRobot,
     OnePolicy,
@@ -20,6 +20,7 @@ from bounce_mjx.config.settings import Count, NonNegativeInt
 from bounce_mjx.config.user_code import import_flags
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation import config as evaluation
+from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import RandomizationConfig
 
 # What is of the evaluation alone; a name that ends with = has a value.
@@ -38,8 +39,8 @@ class EvalCommand(WhichPolicy):
     seed: NonNegativeInt = evaluation.DEFAULT_SEED
     """Seed of the resets."""
     nominal: bool = False
-    """Evaluate without domain randomisation, and with the task's default commands where the policy
-    was trained with them. Without this flag, each episode samples its world and commands, as in
+    """Evaluate without domain randomisation, and with the task's default goals where the policy
+    was trained with them. Without this flag, each episode samples its world and goals, as in
     training."""
     contacts: bool = False
     """Also count contacts of the arm with itself and the floor, which the physics leaves out, in
@@ -57,9 +58,21 @@ class EvalCommand(WhichPolicy):
     """File to write the results to."""
 
 
+_STILL = (
+    "note: the goals do not change within an episode here, as randomization.goal_interval of the "
+    "training is not the task's default"
+)
+
+
+def _stands_still(measured_in: WorldConfig, trained: WorldConfig) -> bool:
+    """Whether the goals change within an episode of the training and not in another world."""
+    intervals = [config.randomization.goal_interval for config in (measured_in, trained)]
+    return intervals[0] is None and intervals[1] is not None
+
+
 def main(args: Sequence[str]) -> None:
     """Runs the command line; exits with 0 if no result fails, 1 if one does, 2 on a mistake."""
-    command, given_commands = parse_with_commands(EvalCommand, args, prog="bounce-mjx eval")
+    command, given_goals = parse_with_goals(EvalCommand, args, prog="bounce-mjx eval")
     from bounce_mjx.evaluation.contacts import arm_contacts, describe_contacts
     from bounce_mjx.evaluation.failures import associations, failures_of
     from bounce_mjx.evaluation.limits import describe_limits, limit_shares
@@ -69,8 +82,8 @@ def main(args: Sequence[str]) -> None:
     from bounce_mjx.reports.figures import image
     from bounce_mjx.reports.tables import details_line, results_table
     from bounce_mjx.runs.checkpoints import read_actor
-    from bounce_mjx.runs.files import check_output, to_json, write_output
     from bounce_mjx.runs.folders import is_users_run
+    from bounce_mjx.runs.storage import check_output, to_json, write_output
     from bounce_mjx.training.setup import set_up_jax
 
     check_output(command.json_file, "--json")
@@ -81,7 +94,8 @@ def main(args: Sequence[str]) -> None:
     config = command.config_of(checkpoint, command.robot, command.world, command.randomization)
     if command.limits and config.env.robot.limits.velocity is None:
         raise UserError("the policy's arm has no command limits (env.robot.limits); omit --limits")
-    task_commands = given_commands.checked(config.env)
+    trained = command.config_of(checkpoint, command.robot)
+    goals = given_goals.checked(config.env)
     set_up_jax(evaluation.on_engine(config.env, command.physics))
     checkpoint, policy, actor = read_actor(checkpoint, config)
     # Beside what is no run, nothing is written.
@@ -93,7 +107,7 @@ def main(args: Sequence[str]) -> None:
         seed=command.seed,
         physics=command.physics,
         nominal=command.nominal,
-        commands=task_commands,
+        goals=goals,
     )
     checks = []
     if command.contacts:
@@ -108,6 +122,9 @@ def main(args: Sequence[str]) -> None:
     print(f"physics: {evaluated.engine}  {length}")
     if evaluated.warning is not None:
         print(f"warning: {evaluated.warning}")
+    measured_in = evaluated.setup.env.config
+    if goals.keys() < measured_in.goals.keys() and _stands_still(measured_in, trained.env):
+        print(_STILL)
     console.print(results_table(report, "the results"))
     print(details_line(report))
     findings = {}
@@ -125,7 +142,7 @@ def main(args: Sequence[str]) -> None:
             "physics": evaluated.engine,
             **report.to_dict(),
             "seed": command.seed,
-            "commands": task_commands,
+            "goals": goals,
             "nominal": command.nominal,
             "world": None if command.world is None else str(command.world),
             "randomization": {

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from bounce_mjx.config.command_line import parse
 from bounce_mjx.config.settings import Finite, Positive, StrictModel
-from bounce_mjx.runs.settings import read_preset
+from bounce_mjx.runs.layers import read_preset
 
 
 class ExciteCommand(StrictModel):
@@ -32,7 +32,7 @@ def main(args: Sequence[str]) -> None:
     """Runs the command line; exits with 2 on a mistake."""
     command = parse(ExciteCommand, args, prog="bounce-mjx excite")
     from bounce_mjx.identify.excitation import excite, to_csv
-    from bounce_mjx.runs.files import write_output
+    from bounce_mjx.runs.storage import write_output
 
     config = read_preset(Path("default"), command.robot).env
     motion = excite(

@@ -24,8 +24,8 @@ def main(args: Sequence[str]) -> None:
     """Runs the command line."""
     command = parse(ExportCommand, args, prog="bounce-mjx export")
     from bounce_mjx.deploy.export import export_onnx
-    from bounce_mjx.runs.files import check_output, write_output
     from bounce_mjx.runs.folders import choose_checkpoint
+    from bounce_mjx.runs.storage import check_output, write_output
     from bounce_mjx.training.setup import set_up_jax
 
     check_output(command.onnx, "--onnx")

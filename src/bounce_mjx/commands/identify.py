@@ -10,7 +10,7 @@ from bounce_mjx.config.settings import NonNegative, StrictModel
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError
 from bounce_mjx.identify import Topics
-from bounce_mjx.runs.settings import read_preset
+from bounce_mjx.runs.layers import read_preset
 
 
 class IdentifyCommand(StrictModel):
@@ -55,7 +55,7 @@ def main(args: Sequence[str]) -> None:
     from bounce_mjx.identify.world_file import compare, to_yaml
     from bounce_mjx.reports.identification import identification_page, inspection_page
     from bounce_mjx.robot.model import joint_names
-    from bounce_mjx.runs.files import check_output, write_output
+    from bounce_mjx.runs.storage import check_output, write_output
     from bounce_mjx.runs.worlds import robot_in_world
     from bounce_mjx.training.setup import set_up_jax
     from bounce_mjx.world.model import world_model

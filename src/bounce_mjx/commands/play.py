@@ -5,7 +5,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from bounce_mjx.commands.task_commands import GivenCommands, parse_with_commands
+from bounce_mjx.commands.goals import GivenGoals, parse_with_goals
 from bounce_mjx.commands.which_policy import (
     MirrorRobot,
     OtherRandomization,
@@ -62,7 +62,7 @@ class PlayCommand(WhichPolicy):
 
 def main(args: Sequence[str]) -> None:
     """Runs the command line; exits with 2 on a mistake."""
-    command, given_commands = parse_with_commands(PlayCommand, args, prog="bounce-mjx play")
+    command, given_goals = parse_with_goals(PlayCommand, args, prog="bounce-mjx play")
     if len(command.checkpoints) > MAX_ENVS:
         raise UserError(f"{len(command.checkpoints)} policies are given; give at most {MAX_ENVS}")
     command.check_log_dir(*command.checkpoints or (None,))
@@ -76,7 +76,7 @@ def main(args: Sequence[str]) -> None:
             what = "is" if len(given) == 1 else "are"
             raise UserError(f"{' and '.join(given)} {what} of an evaluation; add its --episode")
     else:
-        _check_film(command, given_commands)
+        _check_film(command, given_goals)
     # Before the seconds that imports and the compilation take.
     print("starting: the simulation is compiled, which takes longer the first time", flush=True)
     from bounce_mjx.reports.tables import count_text
@@ -89,9 +89,9 @@ def main(args: Sequence[str]) -> None:
 
     chosen = [command.choose(path, command.robot) for path in command.checkpoints or (None,)]
     configs = [_config(checkpoint, command) for checkpoint in chosen]
-    # All are of one task, which `show` checks, and so have the same commands.
+    # All are of one task, which `show` checks, and so have the same goals.
     for config in configs:
-        commands = given_commands.checked(config.env)
+        goals = given_goals.checked(config.env)
     set_up_jax(*(config.env for config in configs))
     shown = []
     for choice, config in zip(chosen, configs, strict=True):
@@ -104,10 +104,10 @@ def main(args: Sequence[str]) -> None:
         film = None
         if command.episode is not None:
             title += f", episode {command.episode}"
-            find = _episode_finder(command, config, commands)
+            find = _episode_finder(command, config, goals)
             film = film_player(find, actor, policy, _evaluation_seed(command))
         shown.append(Shown(config.env, make_controller, title, policy, film))
-    show(shown, command.viewing, commands=commands, console=stdout())
+    show(shown, command.viewing, goals=goals, console=stdout())
 
 
 def _config(checkpoint: "Checkpoint", command: PlayCommand) -> TrainConfig:
@@ -128,7 +128,7 @@ def _num_episodes(command: PlayCommand) -> int:
 
 
 def _episode_finder(
-    command: PlayCommand, config: TrainConfig, commands: dict[str, float]
+    command: PlayCommand, config: TrainConfig, goals: dict[str, float]
 ) -> "Callable[[], InEvaluation]":
     """What finds the place of the episode in that evaluation.
 
@@ -142,7 +142,7 @@ def _episode_finder(
         episodes=_num_episodes(command),
         seed=_evaluation_seed(command),
         nominal=command.nominal,
-        commands=commands,
+        goals=goals,
     )
     if command.condition is None:
         return lambda: InEvaluation(
@@ -157,14 +157,14 @@ def _episode_finder(
     return partial(find_episode, conditions, index, options, command.episode)
 
 
-def _check_film(command: PlayCommand, given_commands: GivenCommands) -> None:
+def _check_film(command: PlayCommand, given_goals: GivenGoals) -> None:
     """Raises UserError for what an episode cannot be shown with."""
     if len(command.checkpoints) > 1 or command.viewing.num_envs > 1:
         raise UserError("--episode shows one episode of one policy; give one policy, one robot")
-    changes = command.nominal or command.randomization.terms or given_commands.values
+    changes = command.nominal or command.randomization.terms or given_goals.values
     if command.condition is not None and changes:
         raise UserError(
-            "--condition is a whole world; omit --nominal, --randomization and the commands"
+            "--condition is a whole world; omit --nominal, --randomization and the goals"
         )
     episodes = _num_episodes(command)
     if command.episode >= episodes:

@@ -39,7 +39,7 @@ def main(args: Sequence[str]) -> None:
     # These take seconds, which a mistake in the words above should not.
     from bounce_mjx.env.env import Env
     from bounce_mjx.reports import curves, figures, page
-    from bounce_mjx.runs.files import writable, write_output
+    from bounce_mjx.runs.storage import writable, write_output
     from bounce_mjx.training.setup import set_up_jax
 
     set_up_jax(*(config.env for config in configs))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
-from bounce_mjx.commands.task_commands import GivenCommands, parse_with_commands
+from bounce_mjx.commands.goals import GivenGoals, parse_with_goals
 from bounce_mjx.commands.which_policy import OtherWorld, WhichPolicy
 from bounce_mjx.config.command_line import Flag
 from bounce_mjx.config.settings import Finite, NonNegative, NonNegativeInt, Positive
@@ -70,7 +70,7 @@ class RehearseCommand(WhichPolicy):
 def main(args: Sequence[str]) -> None:
     """Runs the command line; exits with 1 if the arm stopped without a fault, and with 2 on a
     mistake."""
-    command, given_goals = parse_with_commands(RehearseCommand, args, prog=_PROG)
+    command, given_goals = parse_with_goals(RehearseCommand, args, prog=_PROG)
     is_arm = command.policy is not None and command.policy.suffix in _YAML
     if is_arm and command.robot is not None:
         raise UserError(f"{command.policy} and --robot {command.robot} are two arms; give one")
@@ -80,7 +80,7 @@ def main(args: Sequence[str]) -> None:
         _rehearse_policy(command, given_goals)
 
 
-def _rehearse_policy(command: RehearseCommand, given_goals: GivenCommands) -> None:
+def _rehearse_policy(command: RehearseCommand, given_goals: GivenGoals) -> None:
     if command.motion is not None:
         raise UserError("--motion is for an arm without a policy; leave it out, or give --robot")
     from bounce_mjx.deploy.loading import load_policy
@@ -97,7 +97,7 @@ def _rehearse_policy(command: RehearseCommand, given_goals: GivenCommands) -> No
     home = paddle_position(metadata, np.array(metadata.default_joint_angles))
     box = np.array(command.box or [*(home - _BOX), *(home + _BOX)]).reshape(2, 3)
     print(f"box: --box {' '.join(f'{end:.2f}' for end in box.ravel())}")
-    units = {name: wanted.unit for name, wanted in metadata.commands.items()}
+    units = {name: wanted.unit for name, wanted in metadata.goals.items()}
     with _log(command, metadata.joint_names, units, metadata.num_balls) as recorder:
         session = play(
             policy, arm, command.seconds, arm.is_told, goals, {"box": tuple(box)}, recorder

@@ -57,8 +57,8 @@ def main(args: Sequence[str]) -> None:
     from bounce_mjx.reports import robustness
     from bounce_mjx.reports.figures import image
     from bounce_mjx.runs.checkpoints import read_actor
-    from bounce_mjx.runs.files import to_json, writable, write_output
     from bounce_mjx.runs.folders import is_users_run
+    from bounce_mjx.runs.storage import to_json, writable, write_output
     from bounce_mjx.training.setup import set_up_jax
 
     if command.assumed and command.world is None:

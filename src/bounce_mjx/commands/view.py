@@ -7,7 +7,7 @@ from typing import Literal
 from bounce_mjx.config.command_line import flag_names, parse, read_flags, stdout
 from bounce_mjx.config.files import flat
 from bounce_mjx.config.settings import StrictModel, fields_in
-from bounce_mjx.runs.settings import Choice, read_layers
+from bounce_mjx.runs.layers import Choice, read_layers
 from bounce_mjx.task.registry import DEFAULT
 from bounce_mjx.viewers.options import ViewerOptions
 
@@ -57,4 +57,4 @@ def main(args: Sequence[str]) -> None:
     env = observing(env) if command.actions == "mirror" else env
     set_up_jax(env)
     shown = Shown(env, make_controller[command.actions], _TITLES[command.actions])
-    show([shown], command.viewing, commands={}, console=stdout())
+    show([shown], command.viewing, goals={}, console=stdout())

@@ -14,8 +14,8 @@ from bounce_mjx.errors import UserError, suggest
 from bounce_mjx.resources import policy_folder
 from bounce_mjx.runs import config as run_configs
 from bounce_mjx.runs.config import TrainConfig
+from bounce_mjx.runs.layers import read_preset
 from bounce_mjx.runs.presets import named_file
-from bounce_mjx.runs.settings import read_preset
 from bounce_mjx.runs.worlds import in_named_world, in_sampled_world, trained_in
 from bounce_mjx.task.registry import DEFAULT, find_task
 from bounce_mjx.world.randomization import RandomizationConfig
@@ -173,19 +173,19 @@ class WhichPolicy(StrictModel):
         return choose_checkpoint(path, self.folder)
 
     def choose_run(self, path: Path | None) -> Path:
-        """A run with its log: `named_run`.
+        """A run with its log: `run_or_newest`.
 
         Raises:
           UserError: there is none, or it is a policy of the package, which has no log.
         """
-        from bounce_mjx.runs.folders import named_run
+        from bounce_mjx.runs.folders import run_or_newest
 
         if policy_folder(path) is not None:
             raise UserError(
                 f"the policy {path} comes with the package, without the log of its training; give "
                 "a run's folder"
             )
-        return named_run(path, self.folder)
+        return run_or_newest(path, self.folder)
 
     def config_of_run(self, run: Path) -> TrainConfig:
         """The config of a run.

@@ -221,14 +221,14 @@ def _mark(field: FieldInfo) -> Flag:
 def flag_names(fields: Mapping[str, FieldInfo]) -> dict[str, str]:
     """The flag of each setting by its dotted key: --reset.joint-angles of env.reset.joint_angles.
     Where another setting has that flag, the later one has the whole key, such as --env.seed,
-    because a task's author may give a setting or a command any name."""
+    because a task's author may give a setting or a goal any name."""
     flags: dict[str, str] = {}
     taken = {"--help", "--help-all"}
     # A setting that stands in no group keeps its flag.
     for key in sorted(fields, key=lambda key: "." in key):
         group, dot, name = key.rpartition(".")
         whole = flag_of(group + dot + (_mark(fields[key]).name or name))
-        short = re.sub(r"^--(env|ppo|viewing|commands)\.", "--", whole)
+        short = re.sub(r"^--(env|ppo|viewing|goals)\.", "--", whole)
         flag = whole if short in taken else short
         taken.add(flag)
         if fields[key].annotation is bool:

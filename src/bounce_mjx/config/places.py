@@ -24,10 +24,10 @@ def where_defined(function: Callable[..., Any]) -> str:
     return "" if code is None else _place(code.co_filename, code.co_firstlineno)
 
 
-def where_raised(error: BaseException, function: Callable[..., Any]) -> str:
+def where_raised(error: BaseException, function: Callable[..., Any] | None = None) -> str:
     """The last line of the user's code that an error passed, as in `where_made`; that of the
-    function if it passed none."""
-    place = where_defined(function)
+    function, if any, if it passed none."""
+    place = where_defined(function) if function else ""
     for frame in traceback.extract_tb(error.__traceback__):
         place = _place(frame.filename, frame.lineno) or place
     return place

@@ -10,6 +10,8 @@ PAUSE = 1.0
 # can be computed.
 _SAME_TIME = 1e-9
 MOST_STANDING = 25
+MOST_LATE = 10
+"""Late samples beyond the timely ones, of a loop that is slower than the control steps."""
 
 
 class Clock(NamedTuple):
@@ -25,6 +27,8 @@ class Clock(NamedTuple):
     """Driver's time of the step 0, s."""
     standing: int = 0
     """Calls in a row at this time."""
+    late: int = 0
+    """Samples before which a control step was missed, less the others since then; at least 0."""
 
 
 def advance(clock: Clock, time: float | None, control_dt: float) -> tuple[Clock, float, int]:
@@ -44,8 +48,11 @@ def advance(clock: Clock, time: float | None, control_dt: float) -> tuple[Clock,
     elapsed = time - clock.time
     step = max(clock.step, round((time - clock.origin) / control_dt))
     standing = clock.standing + 1 if abs(elapsed) < _SAME_TIME else 0
-    new = Clock(clock.now + elapsed, step, time, clock.origin, standing)
-    return new, elapsed, step - clock.step
+    steps = step - clock.step
+    late = clock.late + 1 if steps > 1 else clock.late - 1
+    late = min(max(late, 0), MOST_LATE + 1)
+    new = Clock(clock.now + elapsed, step, time, clock.origin, standing, late)
+    return new, elapsed, steps
 
 
 def is_pause(elapsed: float) -> bool:

@@ -21,11 +21,11 @@ from bounce_mjx.errors import UserError
 LARGEST = 1e6
 """Measurements beyond it are not of a robot."""
 _LARGEST_TIME = 1e15
-# A command that is farther outside its range than the range is long, and than this (in its unit),
+# A goal that is farther outside its range than the range is long, and than this (in its unit),
 # is in another unit.
 _ROOM = 0.5
-# Two values of a command that are one.
-_SAME_COMMAND = 1e-6
+# Two values of a goal that are one.
+_SAME_GOAL = 1e-6
 # Resolution of a time as a share of a control step.
 _FINE = 0.25
 _PER_JOINT = frozenset(MEASURED_PER_JOINT)
@@ -66,7 +66,7 @@ class Driver:
             own_names = tuple(self.metadata.joint_names[place] for place in self._places)
             self.own = metadata._replace(joint_names=own_names)
         self.needs = tuple(needs)
-        self.units = UNITS | {name: c.unit or "no unit" for name, c in metadata.commands.items()}
+        self.units = UNITS | {name: c.unit or "no unit" for name, c in metadata.goals.items()}
         """Measurements that a step accepts, and their units."""
         self._sizes = measurement_sizes(metadata)
         balls = metadata.num_balls
@@ -101,7 +101,7 @@ class Driver:
 
         Raises:
           UserError: they have no names; or one is missing, unknown, of another shape, not finite,
-            or a command in another unit.
+            or a goal in another unit.
         """
         if not isinstance(measurements, Mapping):
             measurements = self._in_observation(measurements)
@@ -123,9 +123,9 @@ class Driver:
             checked[name] = _array(label, value, self._sizes[name], self.units[name], limit, rows)
         if self.metadata.velocity != "measured":
             checked.pop("ball_velocity", None)
-        for name, (ends, unit) in self.metadata.commands.items():
+        for name, (ends, unit) in self.metadata.goals.items():
             if name in checked:
-                _check_command(name, float(checked[name][0]), ends, unit or "no unit")
+                _check_goal(name, float(checked[name][0]), ends, unit or "no unit")
         if "time" in measurements:
             self._check_resolution(measurements["time"])
         for name in _PER_JOINT & checked.keys():
@@ -206,13 +206,13 @@ def _index_of(joints: Sequence[str], name: str) -> int:
     return fitting[0] if len(fitting) == 1 else -1
 
 
-def _check_command(name: str, value: float, ends: tuple[float, float], unit: str) -> None:
-    """Raises UserError for a command that no world of the training can hold, or for another one
+def _check_goal(name: str, value: float, ends: tuple[float, float], unit: str) -> None:
+    """Raises UserError for a goal that no world of the training can hold, or for another one
     than the only one of the training."""
     low, high = ends
     if low == high:
         # The network has never seen another value, and cannot heed it.
-        if abs(value - low) > _SAME_COMMAND:
+        if abs(value - low) > _SAME_GOAL:
             raise UserError(
                 f"{name} is {value:.3g}, but the training had {low:.3g} alone ({unit}); give that, "
                 f"or train with a range of {name}"

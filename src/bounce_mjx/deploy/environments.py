@@ -17,7 +17,7 @@ from bounce_mjx.errors import UnexpectedArgument, UserError, shorten, suggest
 from bounce_mjx.resources import POLICIES, policy_folder
 from bounce_mjx.robot.config import is_packaged
 from bounce_mjx.runs.config import load_run_config
-from bounce_mjx.runs.folders import find_run
+from bounce_mjx.runs.folders import run_of
 from bounce_mjx.runs.worlds import NOMINAL, env_of_task, trained_in
 from bounce_mjx.task.registry import (
     DEFAULT,
@@ -130,7 +130,7 @@ def refuse_warmup(config: WorldConfig, title: str) -> None:
     if config.randomization.warmup_steps:
         raise UserError(
             f"{title}: the randomisation has warmup_steps, but its ranges do not grow here; set "
-            "warmup_steps to 0 and first_command_range to 1, or train with TorchVectorEnv"
+            "warmup_steps to 0 and first_goal_range to 1, or train with TorchVectorEnv"
         )
 
 
@@ -177,7 +177,7 @@ def _of_policy(
     if path.suffix == ONNX:
         trained = _environment_in_file(path, settings.get("mjcf"))
     else:
-        trained = load_run_config(find_run(path)).env
+        trained = load_run_config(run_of(path)).env
     name = task_name(task) if isinstance(task, type) else task
     name_of_policy = task_name(trained.task)
     if name is not None and name != name_of_policy:

@@ -24,7 +24,7 @@ from bounce_mjx.deploy.metadata import (
     UNITS,
     BallBounds,
     CommandLimits,
-    CommandRange,
+    GoalRange,
     Hinge,
     Input,
     Metadata,
@@ -122,7 +122,7 @@ def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
 
     Raises:
       UserError: the MJCF file is missing, its paddle hangs on a joint that is not a hinge with a
-        servo, or a command has the name of a measurement.
+        servo, or a goal has the name of a measurement.
     """
     env = config.env
     arm_limits = env.robot.limits
@@ -133,9 +133,9 @@ def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
         limits = CommandLimits(arm_limits.velocity, arm_limits.acceleration, arm_limits.jerk)
         largest_steps = [speed * env.control_dt for speed in arm_limits.velocity]
     displacement = env.randomization.joint_start or (0.0, 0.0)
-    if taken := env.commands.keys() & UNITS.keys():
+    if taken := env.goals.keys() & UNITS.keys():
         raise UserError(
-            f"the command {min(taken)} has the name of a measurement; give it another name in "
+            f"the goal {min(taken)} has the name of a measurement; give it another name in "
             f"the task {env.task.__name__}"
         )
     m = world_model(env, visual=False)
@@ -147,9 +147,9 @@ def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
     joint_ranges = []
     for low, high in m.jnt_range[list(addresses.arm_joints)].tolist():
         joint_ranges.append((low, high) if low < high else None)
-    commands = {}
-    for name, command in env.commands.items():
-        commands[name] = CommandRange((command.low, command.high), command.unit)
+    goals = {}
+    for name, goal in env.goals.items():
+        goals[name] = GoalRange((goal.low, goal.high), goal.unit)
     return Metadata(
         format=FORMAT,
         task=config.task,
@@ -174,7 +174,7 @@ def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
         torque_limits=tuple(np.where(np.isfinite(torques), torques, None).tolist()),
         default_joint_angles=env.default_joint_angles,
         start_noise=env.reset.joint_angles + float(np.max(np.abs(displacement))),
-        commands=commands,
+        goals=goals,
         randomization=_ranges(env.randomization),
         chain=chain,
         paddle=paddle,
@@ -368,13 +368,13 @@ def _control_step(
 
 
 def _measured_shapes(env: WorldConfig) -> dict[str, jax.ShapeDtypeStruct]:
-    """Shapes of what a task may compute its quantities from: the measurements and the commands."""
+    """Shapes of what a task may compute its quantities from: the measurements and the goals."""
     measured = {}
     for name, quantity in ObservationConfig.quantities().items():
         size = quantity.entries(env.num_joints, 1)
         has_rows = quantity.per_ball and env.num_balls > 1
         measured[name] = _floats(env.num_balls, size) if has_rows else _floats(size)
-    for name in env.commands:
+    for name in env.goals:
         measured[name] = _floats(1)
     measured["ball_picture"] = measured["ball_position"]
     return measured

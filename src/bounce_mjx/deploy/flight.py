@@ -2,9 +2,10 @@
 curvature; near it, the ball leaves again unless the task lets it rest.
 
 In free flight a ball's places are x0 + v t + g t^2 / 2. What is left of them after the least
-squares in x0 and v is judged in two directions: the largest of single pictures, and the part along
-t^2, which is a wrong acceleration (0 of a ball that a hand holds). Both are projections on a unit
-vector, so that noise is as large in each, and one bound holds for both.
+squares in x0 and v is judged in three directions: the largest of single pictures; the part along
+t^2, which is a wrong acceleration (0 of a ball that a hand holds); and the largest along a step,
+which is a camera that was bumped, or another ball from a picture on. All are projections on a unit
+vector, so that noise is as large in each, and one bound holds for all.
 """
 
 import math
@@ -24,6 +25,10 @@ _WINDOW = 0.25
 _DEVIATIONS = 5.0
 _LEAST_NOISE = 0.008
 _TIMING = 0.003
+# What a sudden change of velocity leaves of N pictures at most, in a unit vector's direction as a
+# share of its size, their duration and the root of N, and in a single picture (both of 3 pictures).
+_KINK = 0.12
+_KINK_ALONE = 0.17
 # Largest drag of the air with a spin's lift, as a share of the squared speed, 1/m.
 _DRAG = 0.25
 # Speed at which a ball leaves the paddle, m/s, and the height above the paddle's centre at which it
@@ -115,17 +120,37 @@ def fit_fall(times: np.ndarray, places: np.ndarray, noise: float, push: float = 
     drag = 0.5 * _DRAG * squared_speed
     alone_bound = bound + drag * np.abs(bend).max()
     along_bound = bound + drag * bend_size
-    duration = times[-1] - times[0]
+    steps = _along_steps(t, spread, left)
     sizes = np.abs(left).max(axis=0)
-    pushed = 0.25 * push * duration
+    pushed = push * (times[-1] - times[0])
+    alone_pushed = alone_bound + _KINK_ALONE * pushed
+    along_pushed = along_bound + _KINK * math.sqrt(count) * pushed
     ratio = max(
         sizes[2] / alone_bound,
         abs(along[2]) / along_bound,
-        math.hypot(sizes[0], sizes[1]) / (alone_bound + pushed),
-        math.hypot(along[0], along[1]) / (along_bound + pushed * math.sqrt(count)),
+        steps[2] / along_bound,
+        math.hypot(sizes[0], sizes[1]) / alone_pushed,
+        math.hypot(along[0], along[1]) / along_pushed,
+        math.hypot(steps[0], steps[1]) / along_pushed,
     )
     at_rest = 0.5 * GRAVITY * bend_size
     return Fit(float(ratio), at_rest > _DEVIATIONS * noise)
+
+
+def _along_steps(t: np.ndarray, spread: float, left: np.ndarray) -> np.ndarray:
+    """The largest parts [3] of residuals [N, 3] along a step between two pictures, of all steps.
+
+    Args:
+      t: times [N] less their mean, s.
+      spread: sum of their squares.
+    """
+    count = len(t)
+    before = np.arange(1, count)
+    # A step is 0, then 1, less its own least squares in 1 and t.
+    times_before = t.cumsum()[:-1]
+    squared_size = before * (1.0 - before / count) - times_before * times_before / spread
+    parts = left.cumsum(axis=0)[:-1]
+    return np.sqrt((parts * parts / squared_size[:, None]).max(axis=0))
 
 
 def begin(time: float, place: np.ndarray, paddle: np.ndarray) -> Flight:

@@ -10,7 +10,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-FORMAT = 4
+FORMAT = 5
 """Version of the entries; readers refuse other versions."""
 
 UNITS = {
@@ -26,7 +26,7 @@ UNITS = {
     "tool_position": "m",
     "tool_normal": "unit vector",
 }
-"""Measurements that every policy accepts, and their units. A task's commands are further ones."""
+"""Measurements that every policy accepts, and their units. A task's goals are further ones."""
 
 PER_BALL = {
     "ball_position": 3,
@@ -97,8 +97,8 @@ class Hinge(NamedTuple):
     """Joint angle of the unturned hinge, rad."""
 
 
-class CommandRange(NamedTuple):
-    """A command, which is a measurement for the policy."""
+class GoalRange(NamedTuple):
+    """A goal, which is a measurement for the policy."""
 
     range: tuple[float, float]
     """Its range in the training."""
@@ -176,8 +176,8 @@ class Metadata(NamedTuple):
     """Joint angles at the start of an episode, rad."""
     start_noise: float
     """Largest distance of a joint from them at the start of an episode, rad."""
-    commands: dict[str, CommandRange]
-    """The commands of the policy, by name."""
+    goals: dict[str, GoalRange]
+    """The goals of the policy, by name."""
     randomization: dict[str, tuple[float, float]]
     """Ranges of the training's domain randomisation by the keys of `env.randomization`, which
     documents their units; `paddle_tilt[0]` is the range of one axis alone, and `servo_gain[2]` that
@@ -206,12 +206,12 @@ class Metadata(NamedTuple):
 
 
 def measurement_sizes(metadata: Metadata) -> dict[str, int]:
-    """Number of entries of each measurement, in the order of `UNITS`, and of each command; of
+    """Number of entries of each measurement, in the order of `UNITS`, and of each goal; of
     several balls, one after another."""
     joints = dict.fromkeys(MEASURED_PER_JOINT, len(metadata.joint_names))
     balls = {name: size * metadata.num_balls for name, size in PER_BALL.items()}
     sizes = joints | balls | {"tool_position": 3, "tool_normal": 3}
-    return {name: sizes.get(name, 1) for name in (*UNITS, *metadata.commands)}
+    return {name: sizes.get(name, 1) for name in (*UNITS, *metadata.goals)}
 
 
 def joint_ends(metadata: Metadata) -> np.ndarray:
@@ -257,12 +257,12 @@ def from_entries(entries: dict[str, str]) -> Metadata:
     stored = [name for name in Metadata._fields if name in entries]
     values = later | {name: _with_tuples(json.loads(entries[name])) for name in stored}
     limits = values["limits"]
-    commands = values["commands"]
+    goals = values["goals"]
     groups = {
         "ball": BallBounds(**values["ball"]),
         "observation": tuple(Input(**part) for part in values["observation"]),
         "limits": None if limits is None else CommandLimits(**limits),
-        "commands": {name: CommandRange(**command) for name, command in commands.items()},
+        "goals": {name: GoalRange(**goal) for name, goal in goals.items()},
         "chain": tuple(Hinge(**hinge) for hinge in values["chain"]),
     }
     return Metadata(**values | groups)

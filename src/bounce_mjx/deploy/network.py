@@ -109,7 +109,7 @@ class OnnxNetwork:
           history: before the step.
           measured: arrays by name, as many as the policy needs: `joint_angles` [J],
             `joint_velocities` [J], `ball_position` [3], `ball_velocity` [3], `ball_age` [1],
-            commands [1], and so on; of several balls one after another, [6] or [9]; units m, rad
+            goals [1], and so on; of several balls one after another, [6] or [9]; units m, rad
             and s.
           action: that of the step before [J].
           picture: the balls' newest one, of which a velocity from differences is made.

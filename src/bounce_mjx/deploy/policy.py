@@ -15,7 +15,7 @@ from bounce_mjx.deploy.samples import Measurements
 from bounce_mjx.deploy.supervisor import Supervisor
 from bounce_mjx.errors import MissingPackage, UserError
 
-# What a network may need to be measured, beside the commands; the rest has a default, or is looked
+# What a network may need to be measured, beside the goals; the rest has a default, or is looked
 # at by a supervisor alone.
 MEASURED = (
     "joint_angles",
@@ -66,7 +66,7 @@ class DeployedPolicy:
         """A sample that every policy accepts."""
         metadata = self._network.metadata
         trial = {name: np.zeros(size) for name, size in measurement_sizes(metadata).items()}
-        trial |= {name: np.array([c.range[0]]) for name, c in metadata.commands.items()}
+        trial |= {name: np.array([c.range[0]]) for name, c in metadata.goals.items()}
         return trial | {"joint_angles": np.array(metadata.default_joint_angles)}
 
     def _use(self, driver: Driver) -> None:
@@ -144,7 +144,7 @@ class DeployedPolicy:
             `metadata.joint_names`; from the newest picture of the ball `ball_position` [3] (m),
             `ball_velocity` [3] (m/s), `ball_age` (time since the picture was taken, s),
             `ball_quaternion` [4] (w, x, y, z; default 1, 0, 0, 0) and `ball_angular_velocity` [3]
-            (rad/s; default 0); each command in `metadata.commands`; `time` of any clock (s). The
+            (rad/s; default 0); each goal in `metadata.goals`; `time` of any clock (s). The
             measurements in `needs` are required. Without `time`, a step is one control step after
             the last one. Of several balls (`metadata.num_balls`), each quantity has one row per
             ball [B, 3], or the rows one after another. A supervisor also looks at `joint_targets`
@@ -265,7 +265,7 @@ class DeployedPolicy:
         """The measurements of which the network's inputs are made, but those with a default."""
         reads = self._network.reads
         metadata = self._network.metadata
-        names = (*MEASURED, *metadata.commands)
+        names = (*MEASURED, *metadata.goals)
         inputs_of = {name: {name} for name in names}
         inputs_of["joint_angles"] |= {"paddle_position", "servo_lead"}
         inputs_of["ball_position"].add("ball_picture")

@@ -28,7 +28,7 @@ class Recorder(contextlib.AbstractContextManager):
         self,
         path: str | os.PathLike,
         joint_names: Iterable[str],
-        commands: Mapping[str, str] | None = None,
+        goals: Mapping[str, str] | None = None,
         num_balls: int | None = None,
     ):
         """Makes the file. The first row makes its header, which names each column and, in brackets,
@@ -36,7 +36,7 @@ class Recorder(contextlib.AbstractContextManager):
 
         Args:
           joint_names: order of the joints in every array, such as `policy.metadata.joint_names`.
-          commands: unit of each command by its name.
+          goals: unit of each goal by its name.
           num_balls: how many balls a picture shows, such as `policy.metadata.num_balls`; by default
             as many as the first row has. The columns of several are `ball_position.1.x [m]` and so
             on.
@@ -45,7 +45,7 @@ class Recorder(contextlib.AbstractContextManager):
           UserError: the file exists, or cannot be made.
         """
         self._joints = tuple(joint_names)
-        self._commands = dict(commands or {})
+        self._goals = dict(goals or {})
         self._num_balls = num_balls
         self._sizes: dict[str, int] | None = None
         try:
@@ -145,6 +145,6 @@ class Recorder(contextlib.AbstractContextManager):
             balls = ["ball_position"]
         columns["ball_position"] = [f"{ball}.{axis} [m]" for ball in balls for axis in "xyz"]
         columns["ball_time"] = ["ball_time [s]"]
-        columns |= {name: [f"{name} [{unit}]"] for name, unit in self._commands.items()}
+        columns |= {name: [f"{name} [{unit}]"] for name, unit in self._goals.items()}
         self._sizes = {name: len(titles) for name, titles in columns.items()}
         self._rows.writerow(itertools.chain(*columns.values()))

@@ -10,7 +10,8 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from bounce_mjx.deploy.clock import advance
+from bounce_mjx.deploy.box import Box, checked_box
+from bounce_mjx.deploy.clock import MOST_LATE, Clock, advance
 from bounce_mjx.deploy.controller import Controller, Memory
 from bounce_mjx.deploy.driver import LARGEST, Driver
 from bounce_mjx.deploy.faults import Fault, Followed, Watch, check_balls, picture_age
@@ -28,14 +29,11 @@ from bounce_mjx.deploy.samples import Measurements
 from bounce_mjx.errors import UserError
 
 State = Literal["homing", "ready", "running", "braking", "stopped"]
-Box = tuple[Sequence[float], Sequence[float]]
 
 # Of the commands at home, rad.
 _HOME_TOLERANCE = 2e-3
 # On the way home, rad/s.
 _HOME_SPEED = 0.3
-# Of an end of a box from the base, m.
-_FARTHEST_END = 30.0
 # In which an arm comes to rest where its commands do, s.
 _SETTLING = 1.0
 # What the first angles may be off the start pose, where nobody says where the arm rests, beside the
@@ -133,7 +131,7 @@ class Supervisor:
                 raise UserError(f"{name} is {value!r}; give a number above 0 and at most {most:g}")
         self._max_picture_age = age
         self._max_steps_late = max_steps_late
-        self._box = _checked_box(box)
+        self._box = checked_box(box)
         self._has_box = bool(np.any(np.isfinite(self._box)))
         self._watch = Watch(self._metadata)
         self._host_start: float | None = None
@@ -357,7 +355,9 @@ class Supervisor:
 
     def _go_home(self, progress: Progress, measured: Measurements) -> tuple[Progress, int]:
         """A step of the way home, or at home."""
+        before = progress.memory.seen.clock
         seen, measured, steps = self._controller.samples.take(progress.memory.seen, measured)
+        self._check_pace(before, seen.clock)
         progress = progress._replace(memory=progress.memory._replace(seen=seen))
         if steps == 0:
             return progress, 0
@@ -421,9 +421,10 @@ class Supervisor:
         if late > self._max_steps_late:
             raise Fault("late_step", f"a control step came {late} steps late")
         memory, measured, steps = controller.take(progress.memory, measured)
+        seen = memory.seen
+        self._check_pace(clock, seen.clock)
         if steps == 0:
             return progress._replace(memory=memory), 0
-        seen = memory.seen
         if "ball_position" in measured:
             age = seen.clock.now - seen.picture.taken
             if "ball_age" in measured:
@@ -435,6 +436,16 @@ class Supervisor:
         memory = controller.act(memory, measured, steps)
         self._check_box(controller.motion.braking_path(memory.course))
         return progress._replace(memory=memory, followed=followed), steps
+
+    def _check_pace(self, before: Clock, clock: Clock) -> None:
+        """Raises Fault for a loop that is slower than the control steps: its arm would rest after
+        each, and neither play nor get home."""
+        if clock.late > MOST_LATE:
+            raise Fault(
+                "late_step",
+                f"most samples come late, the last one {1e3 * (clock.now - before.now):.0f} ms "
+                f"after the one before; call commands every {1e3 * self._dt:g} ms",
+            )
 
     def _brake(self, progress: Progress, measurements: Mapping[str, Any]) -> tuple[Progress, int]:
         """A step in which the commands brake or rest, whatever is measured."""
@@ -527,23 +538,6 @@ class Supervisor:
             return -math.inf
         paddle = paddle_position(self._metadata, joint_angles)
         return float(np.max([self._box[0] - paddle, paddle - self._box[1]]))
-
-
-def _checked_box(box: Any) -> np.ndarray:
-    """The ends [2, 3] of a box, m; UserError if it is none."""
-    try:
-        ends = np.array(box, float)
-    except (TypeError, ValueError):
-        ends = np.zeros(0)
-    if ends.shape != (2, 3) or not np.all(ends[0] < ends[1]):
-        raise UserError(f"the box is {box}; give its lowest and its highest x, y and z, m")
-    farthest = np.max(np.abs(ends), where=np.isfinite(ends), initial=0.0)
-    if farthest > _FARTHEST_END:
-        raise UserError(
-            f"the box is {box}, and ends {farthest:g} from the base, but no arm reaches "
-            f"{_FARTHEST_END:g} m; give metres, or inf for an end that is not there"
-        )
-    return ends
 
 
 def _fault_of(error: Exception) -> tuple[str, str]:

@@ -13,7 +13,7 @@ from bounce_mjx.env.contract import CheckedTask
 from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.robot.model import Addresses, joint_names, joint_ranges
 from bounce_mjx.task.task import Curve, Task
-from bounce_mjx.world.config import Command, WorldConfig
+from bounce_mjx.world.config import Goal, WorldConfig
 from bounce_mjx.world.limits import check_within
 from bounce_mjx.world.randomization import TERMS
 
@@ -46,17 +46,17 @@ def check_task(config: WorldConfig, task: Task) -> None:
             f"curves of the task {name} is {shorten(repr(curves))}; give a tuple of task.Curve, "
             "such as (task.Curve(...),)"
         )
-    commands = config.commands
-    if not isinstance(commands, Mapping):
+    goals = config.goals
+    if not isinstance(goals, Mapping):
         raise UserError(
-            f"the commands of the task {name} are {shorten(repr(commands))}; return a dictionary "
-            "of a task.Command for each name"
+            f"the goals of the task {name} are {shorten(repr(goals))}; return a dictionary "
+            "of a task.Goal for each name"
         )
-    for command_name, command in commands.items():
-        if not isinstance(command, Command):
+    for goal_name, goal in goals.items():
+        if not isinstance(goal, Goal):
             raise UserError(
-                f"the command {command_name} of the task {name} is {shorten(repr(command))}; give "
-                "a task.Command(low, high)"
+                f"the goal {goal_name} of the task {name} is {shorten(repr(goal))}; give "
+                "a task.Goal(low, high)"
             )
     if not isinstance(task.num_balls, Collection):
         raise UserError(
@@ -69,50 +69,49 @@ def check_task(config: WorldConfig, task: Task) -> None:
             f"num_balls is {config.num_balls}, but the task {name} takes {takes}; set num_balls "
             f"to {takes}"
         )
-    _check_names_of_commands(config)
-    _check_commands_are_seen(config)
-    _check_commands_are_there(config)
+    _check_names_of_goals(config)
+    _check_goals_are_seen(config)
+    _check_goals_are_there(config)
 
 
-def _check_names_of_commands(config: WorldConfig) -> None:
-    """Refuses a command named like a term of the randomisation or a measurement, which would be
+def _check_names_of_goals(config: WorldConfig) -> None:
+    """Refuses a goal named like a term of the randomisation or a measurement, which would be
     taken for it."""
     quantities = config.observation.quantities()
-    for name in config.commands:
-        is_measurement = name in quantities and quantities[name].group != "command"
+    for name in config.goals:
+        is_measurement = name in quantities and quantities[name].group != "goal"
         if name in TERMS or is_measurement:
             kind = "a term of the randomisation" if name in TERMS else "a measurement"
             remedy = "choose another name"
             if name in quantities and quantities[name].group == "task":
                 kind = "a quantity of the task"
-                remedy += ", or give the quantity the group command if it shows the command"
-            raise UserError(f"the command {name} has the name of {kind}; {remedy}")
+                remedy += ", or give the quantity the group goal if it shows the goal"
+            raise UserError(f"the goal {name} has the name of {kind}; {remedy}")
 
 
-def _check_commands_are_there(config: WorldConfig) -> None:
-    """Refuses a quantity of the observation that shows a command that there is not."""
-    for name in config.observation.counts("command"):
-        if name not in config.commands:
-            there_are = ", ".join(config.commands) or "none"
+def _check_goals_are_there(config: WorldConfig) -> None:
+    """Refuses a quantity of the observation that shows a goal that there is not."""
+    for name in config.observation.counts("goal"):
+        if name not in config.goals:
+            there_are = ", ".join(config.goals) or "none"
             raise UserError(
-                f"the observation shows the command {name}, which there is not; there are: "
-                f"{there_are}"
+                f"the observation shows the goal {name}, which there is not; there are: {there_are}"
             )
 
 
-def _check_commands_are_seen(config: WorldConfig) -> None:
-    """Refuses a command that varies and that the policy does not see."""
+def _check_goals_are_seen(config: WorldConfig) -> None:
+    """Refuses a goal that varies and that the policy does not see."""
     if config.observation.counts("task"):
-        # The task computes its own quantities from all measurements and commands.
+        # The task computes its own quantities from all measurements and goals.
         return
     seen = config.observation.counts()
-    for name, command in config.commands.items():
-        varies = command.low < command.high
-        if varies and name not in seen and not command.hidden:
+    for name, goal in config.goals.items():
+        varies = goal.low < goal.high
+        if varies and name not in seen and not goal.hidden:
             raise UserError(
-                f"the policy does not see the command {name}, which varies from "
-                f"{command.low:g} to {command.high:g}; give the observation a quantity {name}, "
-                "fix the command, or mark it as hidden if it acts through others"
+                f"the policy does not see the goal {name}, which varies from "
+                f"{goal.low:g} to {goal.high:g}; give the observation a quantity {name}, "
+                "fix the goal, or mark it as hidden if it acts through others"
             )
 
 
@@ -250,17 +249,17 @@ def _ball_starts(config: WorldConfig, task: Task) -> np.ndarray:
         return at_rest
     draws = np.random.default_rng(0).uniform(size=(_SAMPLED_THROWS, task.num_draws))
     places = np.linspace(0.0, 1.0, _SAMPLED_THROWS)
-    commands = {}
-    for name, command in config.commands.items():
-        commands[name] = command.low + (command.high - command.low) * places
+    goals = {}
+    for name, goal in config.goals.items():
+        goals[name] = goal.low + (goal.high - goal.low) * places
 
-    def positions(draws: jax.Array, command: Mapping[str, jax.Array]) -> Any:
-        thrown = CheckedTask(task, config).throw(draws, command)
+    def positions(draws: jax.Array, goal: Mapping[str, jax.Array]) -> Any:
+        thrown = CheckedTask(task, config).throw(draws, goal)
         return jnp.asarray(at_rest[0] if thrown is None else thrown[0])
 
     # Also within the trace of a reset, whose ranges are known.
     with jax.ensure_compile_time_eval():
-        return np.asarray(jax.vmap(positions)(draws, commands)).reshape(-1, 3)
+        return np.asarray(jax.vmap(positions)(draws, goals)).reshape(-1, 3)
 
 
 def _entrywise(ends: Any, count: int) -> np.ndarray:

@@ -89,11 +89,11 @@ class CheckedTask:
         return Code(getattr(self._task, method), name)
 
     def throw(
-        self, draws: jax.Array, command: Mapping[str, jax.Array]
+        self, draws: jax.Array, goal: Mapping[str, jax.Array]
     ) -> tuple[jax.Array, jax.Array] | None:
         """`Task.throw`: None, or a position and a velocity of each ball."""
         code = self._code("throw")
-        thrown = code(draws, command)
+        thrown = code(draws, goal)
         if thrown is None:
             return None
         parts = []
@@ -113,22 +113,22 @@ class CheckedTask:
             )
         return thrown
 
-    def first_command(self, sampled: dict[str, jax.Array]) -> dict[str, jax.Array]:
-        """`Task.first_command`: one number of floating point for each command."""
-        code = self._code("first_command")
-        command = code(sampled)
-        code.compare(command, Exactly("command", dict.fromkeys(sampled, FLOATING)))
-        return command
+    def first_goal(self, sampled: dict[str, jax.Array]) -> dict[str, jax.Array]:
+        """`Task.first_goal`: one number of floating point for each goal."""
+        code = self._code("first_goal")
+        goal = code(sampled)
+        code.compare(goal, Exactly("goal", dict.fromkeys(sampled, FLOATING)))
+        return goal
 
     def reset(self, start: Start) -> Any:
         """`Task.reset`: any tree."""
         return self._code("reset")(start)
 
-    def next_command(self, state: Any, command: dict[str, jax.Array]) -> dict[str, jax.Array]:
-        """`Task.next_command`: one number of floating point for each command."""
-        code = self._code("next_command")
-        following = code(state, command)
-        code.compare(following, Exactly("command", dict.fromkeys(command, FLOATING)))
+    def next_goal(self, state: Any, goal: dict[str, jax.Array]) -> dict[str, jax.Array]:
+        """`Task.next_goal`: one number of floating point for each goal."""
+        code = self._code("next_goal")
+        following = code(state, goal)
+        code.compare(following, Exactly("goal", dict.fromkeys(goal, FLOATING)))
         return following
 
     def first_quantities(self, measured: dict[str, jax.Array]) -> tuple[Any, dict[str, jax.Array]]:
@@ -240,11 +240,11 @@ class CheckedTask:
         zero = jnp.zeros(())
         moment = Moment(
             truth=step.truth,
-            command=step.command,
+            goal=step.goal,
             state=jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), result.state),
             metrics=dict.fromkeys(metrics, zero),
             seconds=zero,
-            command_seconds=zero,
+            goal_seconds=zero,
         )
         tally = code.shapes(moment)
         code.compare(tally, Tally(sums=Named(ANY_NUMBER), maxima=Named(ANY_NUMBER)))
@@ -262,7 +262,7 @@ class CheckedTask:
             sums=dict.fromkeys(tally.sums, ones),
             maxima=dict.fromkeys(tally.maxima, ones),
             lasted=ones > 0,
-            commands={name: (each.low, each.high) for name, each in self._config.commands.items()},
+            goals={name: (each.low, each.high) for name, each in self._config.goals.items()},
         )
         # The figures are none of real episodes.
         with np.errstate(all="ignore"):

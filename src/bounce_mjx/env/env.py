@@ -55,12 +55,12 @@ _TRUE_QUANTITIES = (
 
 
 class Redraw(NamedTuple):
-    """What later samples of the commands within an episode need, and the age of the last one."""
+    """What later samples of the goals within an episode need, and the age of the last one."""
 
     age: jax.Array
-    """Time since the commands were sampled [], s (an evaluation's `Moment.command_seconds`)."""
+    """Time since the goals were sampled [], s (an evaluation's `Moment.goal_seconds`)."""
     ranges: dict[str, tuple[jax.Array, jax.Array]]
-    """The range of each command."""
+    """The range of each goal."""
 
 
 class ResetDraws(NamedTuple):
@@ -72,8 +72,8 @@ class ResetDraws(NamedTuple):
     """Noise of each joint velocity [n]."""
     ball_positions: jax.Array
     """Noise of each ball's coordinates [B, 3]."""
-    commands: jax.Array
-    """Place of each command within its range [number of commands]."""
+    goals: jax.Array
+    """Place of each goal within its range [number of goals]."""
     task: jax.Array
     """The task's own numbers [num_draws]."""
 
@@ -82,8 +82,8 @@ class EnvState(NamedTuple):
     """The whole state of one environment, `State.pipeline_state`."""
 
     physics: PhysicsState
-    command: dict[str, jax.Array]
-    """Value [] of each command."""
+    goal: dict[str, jax.Array]
+    """Value [] of each goal."""
     last_action: jax.Array
     """Clipped action of the step that led here [n], a task's `Step.action`; zero after a reset."""
     task: Any = ()
@@ -95,7 +95,7 @@ class EnvState(NamedTuple):
     clock: Clock | None = None
     """For a randomised world, or where there is `sensing`."""
     redraw: Redraw | None = None
-    """For commands that are sampled again within an episode."""
+    """For goals that are sampled again within an episode."""
     actuation: ActuationMemory = ActuationMemory()
     steps: jax.Array | None = None
     """Control steps since the reset [], int32, for a task whose step reads the time."""
@@ -201,15 +201,15 @@ class Env:
         return self
 
     def ranges(self, progress: jax.Array | float = 1.0) -> Ranges:
-        """The ranges of the randomisation, and of the commands where they grow too; `progress` []
+        """The ranges of the randomisation, and of the goals where they grow too; `progress` []
         is the share of the warm-up that has passed."""
         ranges = self.config.randomization.ranges(progress, self.nominals)
-        first = self.config.randomization.first_command_range
+        first = self.config.randomization.first_goal_range
         if first == 1.0:
             return ranges
-        for name, command in self.config.commands.items():
-            middle = (command.low + command.high) / 2.0
-            half = (command.high - command.low) / 2.0
+        for name, goal in self.config.goals.items():
+            middle = (goal.low + goal.high) / 2.0
+            half = (goal.high - goal.low) / 2.0
             half *= first + (1.0 - first) * progress
             low = jnp.asarray(middle - half, jnp.float32)
             high = jnp.asarray(middle + half, jnp.float32)
@@ -219,11 +219,11 @@ class Env:
     def reset(
         self, rng: jax.Array, ranges: Ranges | None = None, share: float | None = None
     ) -> State:
-        """Starts an episode, with its own world, clock (`noise.first_clock`), commands and start.
+        """Starts an episode, with its own world, clock (`noise.first_clock`), goals and start.
 
         Args:
           rng: key; consumed.
-          ranges: ranges for all active terms and, if they differ from the config's, for commands;
+          ranges: ranges for all active terms and, if they differ from the config's, for goals;
             by default, the config's. The queues of delayed actions and pictures are only as long as
             the config's ranges need: longer delays are refused or, of traced ends, cut to them,
             in the world too.
@@ -249,24 +249,24 @@ class Env:
         parameters = physics_parameters(world, self.mj_model)._replace(**_given(randomized))
         draws = self._draw(rng)
 
-        command_ranges = self._command_ranges(ranges)
-        sampled = sample_commands(command_ranges, draws.commands)
+        goal_ranges = self._goal_ranges(ranges)
+        sampled = sample_goals(goal_ranges, draws.goals)
         thrown = self._checked_task.throw(draws.task, sampled)
         physics = self._first_physics(draws, world, thrown)
         truth = self._kinematics(physics, parameters)
-        first_command = self._checked_task.first_command(sampled)
-        task = self._checked_task.reset(Start(truth, first_command, draws.task))
-        command = self._checked_task.next_command(task, first_command)
+        first_goal = self._checked_task.first_goal(sampled)
+        task = self._checked_task.reset(Start(truth, first_goal, draws.task))
+        goal = self._checked_task.next_goal(task, first_goal)
 
         state = EnvState(
             physics=physics,
-            command=command,
+            goal=goal,
             last_action=jnp.zeros(self.action_size, physics.qpos.dtype),
             task=task,
             parameters=parameters,
             world=world,
             clock=clock,
-            redraw=self._first_redraw(world, command_ranges, physics.qpos.dtype),
+            redraw=self._first_redraw(world, goal_ranges, physics.qpos.dtype),
             actuation=self._actuators.first(physics.qpos),
         )
         if self._sensors.are_needed:
@@ -287,8 +287,8 @@ class Env:
         episode and acts as 0.
 
         The action becomes the servos' targets, which latency and lag delay (`Actuators.next`); the
-        physics takes its steps; the task judges the true state under the command that the policy
-        has seen; then commands change, the clock moves on, and the sensors measure.
+        physics takes its steps; the task judges the true state under the goal that the policy
+        has seen; then goals change, the clock moves on, and the sensors measure.
 
         Raises:
           UserError: the action has another shape, which NumPy's rules would spread over the joints.
@@ -340,7 +340,7 @@ class Env:
             after = after._replace(steps=before.steps + 1)
         task_step = Step(
             truth=truth,
-            command=before.command,
+            goal=before.goal,
             action=action,
             last_action=before.last_action,
             ball_radius=before.parameters.ball_radius,
@@ -352,10 +352,10 @@ class Env:
             "too_fast": jnp.any(jnp.abs(truth.joint_velocities) > self.config.max_joint_velocity),
         }
 
-        after = self._redraw_commands(after)
+        after = self._redraw_goals(after)
         # The reset has compared what it returns.
-        command = self.task.next_command(result.state, after.command)
-        after = after._replace(task=result.state, command=command)
+        goal = self.task.next_goal(result.state, after.goal)
+        after = after._replace(task=result.state, goal=goal)
         if after.clock is not None:
             after = after._replace(clock=noise.next_clock(after.clock))
         if after.sensing is not None:
@@ -413,16 +413,16 @@ class Env:
         num_joints = self.action_size
         num_balls = self.config.num_balls
         num_noises = 2 * num_joints + 3 * num_balls
-        num_commands = len(self.config.commands)
+        num_goals = len(self.config.goals)
         # One sample for all numbers: splitting keys for several would cost more than they do.
-        count = num_noises + num_commands + self.task.num_draws
+        count = num_noises + num_goals + self.task.num_draws
         draws = jax.random.uniform(rng, (count,), minval=-1.0, maxval=1.0)
-        noises, commands, task = jnp.split(draws, [num_noises, num_noises + num_commands])
+        noises, goals, task = jnp.split(draws, [num_noises, num_noises + num_goals])
         return ResetDraws(
             joint_angles=noises[:num_joints],
             joint_velocities=noises[num_joints : 2 * num_joints],
             ball_positions=noises[2 * num_joints :].reshape(num_balls, 3),
-            commands=0.5 * (commands + 1.0),
+            goals=0.5 * (goals + 1.0),
             task=0.5 * (task + 1.0),
         )
 
@@ -461,49 +461,47 @@ class Env:
             qvel = scatter(qvel, ball.qvel[:3], velocities[i])
         return PhysicsState(qpos, qvel)
 
-    def _command_ranges(self, ranges: Ranges) -> Ranges:
-        """The range of each command: one of `ranges`, or the config's."""
+    def _goal_ranges(self, ranges: Ranges) -> Ranges:
+        """The range of each goal: one of `ranges`, or the config's."""
         return {
-            name: ranges.get(name, (command.low, command.high))
-            for name, command in self.config.commands.items()
+            name: ranges.get(name, (goal.low, goal.high))
+            for name, goal in self.config.goals.items()
         }
 
     def _first_redraw(self, world: World, ranges: Ranges, dtype: jnp.dtype) -> Redraw | None:
-        """What later samples of the commands need; None if they are not sampled again."""
-        if "command_interval" not in world:
+        """What later samples of the goals need; None if they are not sampled again."""
+        if "goal_interval" not in world:
             return None
-        command_ranges = {}
+        goal_ranges = {}
         for name, (low, high) in ranges.items():
-            command_ranges[name] = (jnp.asarray(low, dtype), jnp.asarray(high, dtype))
-        return Redraw(age=jnp.zeros((), dtype), ranges=command_ranges)
+            goal_ranges[name] = (jnp.asarray(low, dtype), jnp.asarray(high, dtype))
+        return Redraw(age=jnp.zeros((), dtype), ranges=goal_ranges)
 
-    def _redraw_commands(self, state: EnvState) -> EnvState:
-        """The state with new commands after a control step in which their interval passes; its
+    def _redraw_goals(self, state: EnvState) -> EnvState:
+        """The state with new goals after a control step in which their interval passes; its
         clock is still that of the step."""
         if state.redraw is None:
             return state
         age, ranges = state.redraw
         clock = state.clock
-        is_due = noise.is_due(
-            state.world["command_interval"], clock.command_phase, clock.step, self.dt
-        )
+        is_due = noise.is_due(state.world["goal_interval"], clock.goal_phase, clock.step, self.dt)
         # At the reset, the clock's counter has given the phases from this stream.
         counter = noise.next_counter(clock.counter)
-        draws = noise.uniform(counter, noise.COMMAND, (len(ranges),), age.dtype)
+        draws = noise.uniform(counter, noise.GOAL, (len(ranges),), age.dtype)
         # JAX has sorted the keys of the state's dictionary.
-        in_order = {name: ranges[name] for name in self.config.commands}
-        new_command = self.task.first_command(sample_commands(in_order, draws))
-        command = {}
-        for name, last_value in state.command.items():
-            command[name] = jnp.where(is_due, new_command[name], last_value)
+        in_order = {name: ranges[name] for name in self.config.goals}
+        new_goal = self.task.first_goal(sample_goals(in_order, draws))
+        goal = {}
+        for name, last_value in state.goal.items():
+            goal[name] = jnp.where(is_due, new_goal[name], last_value)
         redraw = Redraw(age=jnp.where(is_due, 0.0, age + self.dt), ranges=ranges)
-        return state._replace(command=command, redraw=redraw)
+        return state._replace(goal=goal, redraw=redraw)
 
     def _outline(self, state: EnvState, truth: Kinematics) -> Outline:
         """What the task's step returns, traced from the state of a reset."""
         step = Step(
             truth=truth,
-            command=state.command,
+            goal=state.goal,
             action=state.last_action,
             last_action=state.last_action,
         )
@@ -550,17 +548,17 @@ class Env:
         Args:
           truth: `kinematics(state)`, if it has already been computed.
         """
-        commands = {name: value[None] for name, value in state.command.items()}
+        goals = {name: value[None] for name, value in state.goal.items()}
         if state.sensing is None:
             truth = self.kinematics(state) if truth is None else truth
-            values = truth._asdict() | commands
+            values = truth._asdict() | goals
         else:
             values = dict(state.sensing.histories)
-            # A command may have been set since the last step. (A loop over a set of names would
+            # A goal may have been set since the last step. (A loop over a set of names would
             # have another order, and so another program, in each process.)
-            for name, command in commands.items():
+            for name, goal in goals.items():
                 if name in values:
-                    values[name] = jnp.concatenate([command[None], values[name][1:]])
+                    values[name] = jnp.concatenate([goal[None], values[name][1:]])
         return self.layout.pack({name: jnp.ravel(value) for name, value in values.items()})
 
     def with_world(self, state: EnvState, world: World) -> EnvState:
@@ -592,9 +590,9 @@ class Env:
         return metrics
 
 
-def sample_commands(ranges: Ranges, draws: jax.Array) -> dict[str, jax.Array]:
-    """A sample [] of each command within its range, from numbers between 0 and 1 [number of
-    commands]."""
+def sample_goals(ranges: Ranges, draws: jax.Array) -> dict[str, jax.Array]:
+    """A sample [] of each goal within its range, from numbers between 0 and 1 [number of
+    goals]."""
     sampled = {}
     for draw, (name, (low, high)) in zip(draws, ranges.items(), strict=True):
         sampled[name] = low + (high - low) * draw
@@ -629,7 +627,7 @@ def _instant(state: EnvState, truth: Kinematics) -> Instant:
     """What the sensors depend on in a state."""
     return Instant(
         truth=truth,
-        command=state.command,
+        goal=state.goal,
         last_action=state.last_action,
         setpoint=state.actuation.setpoint,
         world=state.world,

@@ -253,15 +253,8 @@ def _explained(error: Exception, args: tuple[Any, ...]) -> str:
             "traced for all; write jnp.where, & and |"
         )
     text = f"{kind}: {shorten(reason_of(error), 300)}"
-    name = None
-    known = []
-    if isinstance(error, AttributeError):
-        name = error.name
-        known = dir(error.obj)
-    elif isinstance(error, KeyError) and error.args:
-        name = error.args[0]
-        known = _names_in(args)
-    if isinstance(name, str) and (near := suggest(name, known)):
+    name = error.args[0] if isinstance(error, KeyError) and error.args else None
+    if isinstance(name, str) and (near := suggest(name, _names_in(args))):
         text += f" ({near})"
     return text
 

@@ -35,7 +35,7 @@ def check_ranges(
     """Refuses ranges of a reset that the environment cannot act on.
 
     Args:
-      ranges: of all active terms, and of commands. Of traced ends the shapes alone are known;
+      ranges: of all active terms, and of goals. Of traced ends the shapes alone are known;
         `within_queues` keeps what is sampled from them within the queues.
       nominals: the terms' values without randomisation, from which a warm-up grows their ranges.
 
@@ -44,20 +44,20 @@ def check_ranges(
 
     Raises:
       UserError: the ranges lack a term, have an unknown one or ends of another shape, are no ranges
-        within the bounds of the term or of the command, or reach beyond the queues of the config.
+        within the bounds of the term or of the goal, or reach beyond the queues of the config.
     """
     terms = config.randomization.terms
-    commands = config.commands
-    # The commands are on both sides, as none needs a range and each may have one.
-    check_names("a reset", "range", {*ranges, *commands}, {*terms, *commands})
+    goals = config.goals
+    # The goals are on both sides, as none needs a range and each may have one.
+    check_names("a reset", "range", {*ranges, *goals}, {*terms, *goals})
     known = {}
     for name, ends in ranges.items():
         _check_shape(name, ends, config.num_joints)
         numbers = _numbers(ends)
         if numbers is None:
             continue
-        if name in commands:
-            low, high = (commands[name].checked(end, f"{_SOURCE}: {name}") for end in numbers)
+        if name in goals:
+            low, high = (goals[name].checked(end, f"{_SOURCE}: {name}") for end in numbers)
             if low > high:
                 raise UserError(f"{_SOURCE}: {name} is from {low:g} to {high:g}; exchange the two")
         else:

@@ -23,9 +23,9 @@ def on_engine(env: WorldConfig, physics: Physics) -> WorldConfig:
     return env.model_copy(update={"physics": physics}) if physics in ("fused", "mjx") else env
 
 
-def command_ranges(env: WorldConfig) -> dict[str, tuple[float, float]]:
-    """The range from which each command is sampled."""
-    return {name: (command.low, command.high) for name, command in env.commands.items()}
+def goal_ranges(env: WorldConfig) -> dict[str, tuple[float, float]]:
+    """The range from which each goal is sampled."""
+    return {name: (goal.low, goal.high) for name, goal in env.goals.items()}
 
 
 class EvaluationOptions(NamedTuple):
@@ -37,10 +37,10 @@ class EvaluationOptions(NamedTuple):
     """The seed of the resets."""
     physics: Physics = "config"
     nominal: bool = False
-    """Whether the worlds are the model's own, with the task's default commands where the policy was
+    """Whether the worlds are the model's own, with the task's default goals where the policy was
     trained with them; else both are sampled as in the training."""
-    commands: dict[str, float] = {}
-    """Commands by name with one value for all episodes; the others are sampled."""
+    goals: dict[str, float] = {}
+    """Goals by name with one value for all episodes; the others are sampled."""
 
 
 DEFAULT_OPTIONS = EvaluationOptions()

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from bounce_mjx.env.env import Env
-from bounce_mjx.evaluation.config import command_ranges
+from bounce_mjx.evaluation.config import goal_ranges
 from bounce_mjx.evaluation.episodes import make_filmer
 from bounce_mjx.evaluation.policy_evaluation import EpisodeSetup
 from bounce_mjx.evaluation.results import episodes_of, is_share
@@ -33,8 +33,8 @@ class Failure(NamedTuple):
     """Whether it lasted until its time limit."""
     failed: tuple[str, ...]
     """Why it ended early, and the results that its own figures miss."""
-    command: dict[str, float]
-    """First value of each command."""
+    goal: dict[str, float]
+    """First value of each goal."""
     world: dict[str, float | list[float]]
     """Values of the active terms of the randomisation."""
 
@@ -51,7 +51,7 @@ class Third(NamedTuple):
 
 
 class Association(NamedTuple):
-    """How failure goes with a term of the world, or with a command."""
+    """How failure goes with a term of the world, or with a goal."""
 
     name: str
     thirds: tuple[Third, ...]
@@ -73,12 +73,12 @@ def failures_of(setup: EpisodeSetup, statistics: Statistics) -> list[Failure]:
     """The failed episodes of an evaluation, each judged alone: one that lasts may miss a result
     that all together meet."""
     env = setup.env
-    commands = command_ranges(env.config) | setup.commands
+    goals = goal_ranges(env.config) | setup.goals
     s = jax.tree.map(np.asarray, statistics)
     found = []
     for i in range(len(s.running)):
         alone = jax.tree.map(lambda figure, i=i: figure[i : i + 1], s)
-        results = env.task.results(episodes_of(alone, commands))
+        results = env.task.results(episodes_of(alone, goals))
         # A mean over all episodes says nothing of one of them.
         shares = [result for result in results if is_share(result.measured)]
         missed = [result for result in shares if result.passed is False]
@@ -90,14 +90,14 @@ def failures_of(setup: EpisodeSetup, statistics: Statistics) -> list[Failure]:
         if not lasted:
             failed.insert(0, _cause(s.ended_by, i))
         if failed:
-            command = {name: float(values[i]) for name, values in s.command.items()}
+            goal = {name: float(values[i]) for name, values in s.goal.items()}
             world = {name: values[i].astype(float).tolist() for name, values in s.world.items()}
             failure = Failure(
                 episode=i,
                 seconds=float(s.steps[i]) * env.dt,
                 lasted=lasted,
                 failed=tuple(failed),
-                command=command,
+                goal=goal,
                 world=world,
             )
             found.append(failure)
@@ -111,12 +111,12 @@ def _cause(ended_by: dict[str, np.ndarray], index: int) -> str:
 
 
 def associations(statistics: Statistics, failures: list[Failure]) -> list[Association]:
-    """The share of failures by third of the range of each command and each entry of each term; the
+    """The share of failures by third of the range of each goal and each entry of each term; the
     clear ones first, then the largest difference."""
     s = jax.tree.map(np.asarray, statistics)
     has_failed = np.zeros(len(s.running), bool)
     has_failed[[failure.episode for failure in failures]] = True
-    columns = dict(s.command)
+    columns = dict(s.goal)
     for name, values in s.world.items():
         entries = values.reshape(len(values), -1)
         for i, entry in enumerate(entries.T):

@@ -11,13 +11,13 @@ from bounce_mjx.evaluation.c_episodes import make_mujoco_evaluator
 from bounce_mjx.evaluation.config import (
     DEFAULT_OPTIONS,
     EvaluationOptions,
-    command_ranges,
+    goal_ranges,
     on_engine,
 )
 from bounce_mjx.evaluation.episodes import make_evaluator
 from bounce_mjx.evaluation.results import Report, judge
 from bounce_mjx.evaluation.statistics import Statistics
-from bounce_mjx.evaluation.suite import neutral_commands
+from bounce_mjx.evaluation.suite import neutral_goals
 from bounce_mjx.learning.policy import Actor, Policy
 from bounce_mjx.physics.convergence import solver_warning
 from bounce_mjx.world.config import WorldConfig
@@ -28,10 +28,10 @@ class EpisodeSetup(NamedTuple):
     """From what the episodes of an evaluation are sampled."""
 
     env: Env
-    commands: dict[str, tuple[float, float]]
-    """Ranges of commands in the episodes that are judged; those left out have the config's."""
+    goals: dict[str, tuple[float, float]]
+    """Ranges of goals in the episodes that are judged; those left out have the config's."""
     ranges: Ranges | None
-    """Ranges of the worlds and commands of one or more conditions, each end [C, ...], as for
+    """Ranges of the worlds and goals of one or more conditions, each end [C, ...], as for
     `reset_episodes`; None for the config's."""
 
 
@@ -84,31 +84,29 @@ def evaluate_policy(
     evaluate = make(env, actor(env), options.episodes, recorded)
     statistics, recording = evaluate(policy, jax.random.PRNGKey(options.seed), setup.ranges)
     warning = solver_warning(env.mj_model) if on_c else None
-    report = judge(env, statistics, recording, setup.commands)
+    report = judge(env, statistics, recording, setup.goals)
     return PolicyEvaluation(report, engine, warning, setup, jax.device_get(statistics))
 
 
 def setup_of(env_config: WorldConfig, options: EvaluationOptions) -> EpisodeSetup:
-    """The environment of an evaluation, and the ranges of its worlds and commands.
+    """The environment of an evaluation, and the ranges of its worlds and goals.
 
     Raises:
       UserError: the engine does not support the model.
     """
-    trained = command_ranges(env_config)
-    commands = neutral_commands(env_config) if options.nominal else {}
-    commands |= {name: (value, value) for name, value in options.commands.items()}
+    trained = goal_ranges(env_config)
+    goals = neutral_goals(env_config) if options.nominal else {}
+    goals |= {name: (value, value) for name, value in options.goals.items()}
     # A range of the config's own is no input of the program.
-    commands = {name: ends for name, ends in commands.items() if ends != trained[name]}
+    goals = {name: ends for name, ends in goals.items() if ends != trained[name]}
 
-    randomization = env_config.randomization
-    if options.nominal:
-        randomization = RandomizationConfig()
-    elif options.commands.keys() >= trained.keys():
-        # Each command has one value, so that none changes within an episode.
-        randomization = randomization.model_copy(update={"command_interval": None})
-    world = env_config.model_copy(update={"randomization": randomization})
+    world = env_config.in_world(RandomizationConfig()) if options.nominal else env_config
+    if options.goals.keys() >= trained.keys():
+        # Each goal has one value, so that none changes within an episode.
+        randomization = world.randomization.model_copy(update={"goal_interval": None})
+        world = world.model_copy(update={"randomization": randomization})
     env = Env(on_engine(world, options.physics))
-    if not commands:
-        return EpisodeSetup(env, commands, ranges=None)
-    ranges = jax.tree.map(lambda end: jnp.asarray(end, jnp.float32)[None], env.ranges() | commands)
-    return EpisodeSetup(env, commands, ranges)
+    if not goals:
+        return EpisodeSetup(env, goals, ranges=None)
+    ranges = jax.tree.map(lambda end: jnp.asarray(end, jnp.float32)[None], env.ranges() | goals)
+    return EpisodeSetup(env, goals, ranges)

@@ -10,7 +10,7 @@ from pydantic import Field, InstanceOf
 
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError, shorten
-from bounce_mjx.evaluation.config import command_ranges
+from bounce_mjx.evaluation.config import goal_ranges
 from bounce_mjx.evaluation.statistics import Statistics
 from bounce_mjx.task.results import Episodes, Figure, Result
 from bounce_mjx.task.task import Recording, Task
@@ -75,28 +75,28 @@ def is_share(measured: str) -> bool:
     return measured.endswith("%")
 
 
-def episodes_of(statistics: Statistics, commands: dict[str, tuple[float, float]]) -> Episodes:
+def episodes_of(statistics: Statistics, goals: dict[str, tuple[float, float]]) -> Episodes:
     """Statistics of E episodes as a task judges them: NumPy arrays, the figures in float64.
 
     Args:
-      commands: range of each command in these episodes.
+      goals: range of each goal in these episodes.
     """
     tally = jax.tree.map(lambda figure: np.asarray(figure, np.float64), statistics.tally)
-    return Episodes(tally.sums, tally.maxima, np.asarray(statistics.running), commands)
+    return Episodes(tally.sums, tally.maxima, np.asarray(statistics.running), goals)
 
 
 def judge(
     env: Env,
     statistics: Statistics,
     recording: Recording | None = None,
-    commands: dict[str, tuple[float, float]] | None = None,
+    goals: dict[str, tuple[float, float]] | None = None,
     task: Task | None = None,
 ) -> Report:
     """The report of an evaluation, from the statistics of E episodes.
 
     Args:
       recording: of the first episodes.
-      commands: ranges of commands in these episodes, where they are not the config's.
+      goals: ranges of goals in these episodes, where they are not the config's.
       task: the task with the settings of these episodes, where they are not the environment's.
 
     Raises:
@@ -104,7 +104,7 @@ def judge(
     """
     task = task or env.task
     measured = jax.device_get(statistics)
-    episodes = episodes_of(measured, command_ranges(env.config) | (commands or {}))
+    episodes = episodes_of(measured, goal_ranges(env.config) | (goals or {}))
     results = task.results(episodes)
     task_details = task.details(episodes)
     _check_results(results, task)

@@ -15,7 +15,7 @@ from pydantic import Field
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.c_episodes import make_mujoco_evaluator
-from bounce_mjx.evaluation.config import EvaluationOptions, Physics, command_ranges, on_engine
+from bounce_mjx.evaluation.config import EvaluationOptions, Physics, goal_ranges, on_engine
 from bounce_mjx.evaluation.episodes import make_evaluator
 from bounce_mjx.evaluation.policy_evaluation import EpisodeSetup, InEvaluation
 from bounce_mjx.evaluation.results import is_share, judge
@@ -125,7 +125,7 @@ def measure_conditions(
     Args:
       actor: what acts with the policy, such as the networks of its training (`networks_of`).
       options: the number of episodes in each condition, their seed and the engine; a condition has
-        its own world and commands.
+        its own world and goals.
       progress: callback for the number of finished conditions.
 
     Raises:
@@ -177,7 +177,7 @@ def find_episode(
     start = place // size * size
     ranges = _stack_ranges(program.inputs, _padded(members[start : start + size], size))
     return InEvaluation(
-        setup=EpisodeSetup(program.env, condition.commands, ranges),
+        setup=EpisodeSetup(program.env, condition.goals, ranges),
         episodes=size * options.episodes,
         episode=(place - start) * options.episodes + episode,
     )
@@ -197,7 +197,7 @@ class _Program(NamedTuple):
 
     env: Env
     inputs: list[str]
-    """Names of the terms and the commands whose ranges are inputs."""
+    """Names of the terms and the goals whose ranges are inputs."""
     on_c: bool
     """Whether MuJoCo's C engine simulates all of them."""
 
@@ -207,10 +207,10 @@ def _program(members: Sequence[Condition], physics: Physics) -> _Program:
     env = Env(_spanning_config(members, physics))
     is_dry = any("joint_frictionloss" in condition.ranges for condition in members)
     on_c = physics == "mujoco" or (env.engine.name == "mjx" and is_dry)
-    # Of the commands, those for which a condition has another range than the config.
+    # Of the goals, those for which a condition has another range than the config.
     changed = []
-    for name, ends in command_ranges(env.config).items():
-        if any(condition.commands[name] != ends for condition in members):
+    for name, ends in goal_ranges(env.config).items():
+        if any(condition.goals[name] != ends for condition in members):
             changed.append(name)
     return _Program(env, [*env.config.randomization.terms, *changed], on_c)
 
@@ -227,7 +227,7 @@ def _outcome(program: _Program, condition: Condition, statistics: Statistics) ->
     # that of the settings, which all of them share.
     task = condition.config.task(condition.config)
     task.geometry = program.env.task.geometry
-    report = judge(program.env, statistics, commands=condition.commands, task=task)
+    report = judge(program.env, statistics, goals=condition.goals, task=task)
     return ConditionOutcome(
         perturbation=condition.perturbation.name,
         group=condition.perturbation.group,

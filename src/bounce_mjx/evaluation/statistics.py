@@ -33,8 +33,8 @@ class Statistics(NamedTuple):
     ended the others."""
     world: dict[str, jax.Array] = {}
     """World of the episode: its values of the active terms [E, ...]."""
-    command: dict[str, jax.Array] = {}
-    """First value of each command [E]."""
+    goal: dict[str, jax.Array] = {}
+    """First value of each goal [E]."""
 
 
 Measured = tuple[Statistics, Recording]
@@ -47,11 +47,11 @@ def moment(env: Env, state: State, step: jax.Array) -> Moment:
     seconds = (step + 1) * env.dt
     return Moment(
         truth=env.kinematics(now),
-        command=now.command,
+        goal=now.goal,
         state=now.task,
         metrics=state.metrics,
         seconds=seconds,
-        command_seconds=seconds if now.redraw is None else now.redraw.age,
+        goal_seconds=seconds if now.redraw is None else now.redraw.age,
     )
 
 
@@ -68,7 +68,7 @@ def empty_statistics(env: Env, states: State) -> Statistics:
         tally=jax.tree.map(lambda _: zeros, tally),
         ended_by={name: jnp.zeros(episodes, bool) for name in ENDS if name in states.metrics},
         world={name: jnp.moveaxis(value, -1, 0) for name, value in start.world.items()},
-        command=dict(start.command),
+        goal=dict(start.goal),
     )
 
 
@@ -153,7 +153,7 @@ def _row(env: Env, states: State, running: jax.Array, step: jax.Array) -> Record
             joint_angles=now.truth.joint_angles,
             ball=now.truth.ball_position,
             paddle=now.truth.paddle_position,
-            command=now.command,
+            goal=now.goal,
             running=running,
             terminated=running & (state.done > 0),
             command_velocity=None if setpoint is None else setpoint.velocity,

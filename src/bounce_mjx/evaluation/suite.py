@@ -17,7 +17,7 @@ from bounce_mjx.config.settings import Finite, StrictModel, merged, nested
 from bounce_mjx.config.validation import validate
 from bounce_mjx.env.checks import check_starts
 from bounce_mjx.errors import UserError, shorten, warn_once
-from bounce_mjx.evaluation.config import command_ranges
+from bounce_mjx.evaluation.config import goal_ranges
 from bounce_mjx.physics.edited import NO_PAIR
 from bounce_mjx.robot.model import Addresses, find_addresses
 from bounce_mjx.task.registry import find_task
@@ -40,9 +40,9 @@ NOMINAL = "nominal"
 """Name of the condition without perturbation, which is always measured."""
 
 _SIGNS = {"strength": 1.0, "-strength": -1.0}
-# Neutral values of terms that have none in `TERMS`: commands that never change, and pushes that
+# Neutral values of terms that have none in `TERMS`: goals that never change, and pushes that
 # come at any interval, as their neutral speed is 0, s.
-_INTERVALS = {"command_interval": 1e9, "push_interval": DEFAULT_PUSH_INTERVAL}
+_INTERVALS = {"goal_interval": 1e9, "push_interval": DEFAULT_PUSH_INTERVAL}
 
 Bounds = tuple[np.ndarray, np.ndarray]
 
@@ -59,7 +59,7 @@ class Perturbation(StrictModel):
     task: str | None = None
     """Name of the task that it is for; by default, it is for all."""
     terms: dict[str, Any] = {}
-    """Values for terms of `env.randomization` and for commands of the task: see
+    """Values for terms of `env.randomization` and for goals of the task: see
     `configs/robustness.yaml`."""
     settings: dict[str, Any] = {}
     """New values for settings of `env`, by dotted names."""
@@ -88,7 +88,7 @@ class Condition(NamedTuple):
     """The active terms, each with its range; every episode samples all of them, whatever its
     `share`."""
     ranges: dict[str, Bounds]
-    """Lower and upper ends of the ranges of all commands and of the active terms, in the shapes of
+    """Lower and upper ends of the ranges of all goals and of the active terms, in the shapes of
     the terms."""
     trained: bool
     """Whether the policy's training has episodes in every world of the condition: no setting
@@ -101,7 +101,7 @@ class Condition(NamedTuple):
         return condition_label(self.perturbation.name, self.strength, self.perturbation.unit)
 
     def range(self, name: str) -> Bounds:
-        """Range of a command, or of a term; a term that is not active has its neutral one.
+        """Range of a goal, or of a term; a term that is not active has its neutral one.
 
         Raises:
           UserError: it has none, because the model lacks a contact pair.
@@ -117,9 +117,9 @@ class Condition(NamedTuple):
         return self.env.model_copy(update={"randomization": self.randomization})
 
     @property
-    def commands(self) -> dict[str, tuple[float, float]]:
-        """Range of each command."""
-        return {name: tuple(map(float, self.ranges[name])) for name in self.env.commands}
+    def goals(self) -> dict[str, tuple[float, float]]:
+        """Range of each goal."""
+        return {name: tuple(map(float, self.ranges[name])) for name in self.env.goals}
 
 
 def condition_label(perturbation: str, strength: float | None, unit: str) -> str:
@@ -225,22 +225,22 @@ def _check_content(perturbation: Perturbation, source: str) -> None:
 
 
 def neutral_range(name: str, env: WorldConfig) -> Bounds | None:
-    """Range of a term, not of a command, without effect on the world; None if it has none."""
+    """Range of a term, not of a goal, without effect on the world; None if it has none."""
     value = _INTERVALS.get(name, TERMS[name].nominal)
     if value == MODEL:
         value = model_nominals(env).get(name)
     return None if value is None else _broadcast(name, env.num_joints, value, value)
 
 
-def neutral_commands(env: WorldConfig) -> dict[str, tuple[float, float]]:
-    """Range of each command in a world without randomisation: the task's default range for all
+def neutral_goals(env: WorldConfig) -> dict[str, tuple[float, float]]:
+    """Range of each goal in a world without randomisation: the task's default range for all
     policies that were trained with it, so that those with wider ranges are measured like the
     others; else the policy's own."""
-    ranges = dict(env.commands)
-    for name, default in type(env)().commands.items():
+    ranges = dict(env.goals)
+    for name, default in type(env)().goals.items():
         if ranges[name].low <= default.low and default.high <= ranges[name].high:
             ranges[name] = default
-    return {name: (command.low, command.high) for name, command in ranges.items()}
+    return {name: (goal.low, goal.high) for name, goal in ranges.items()}
 
 
 def _condition(
@@ -253,18 +253,18 @@ def _condition(
     value = None if strength is None else strength * UNITS[perturbation.unit]
     base = training.config if perturbation.trained_ranges else world
     env = _with_changes(_unrandomized(base), _fill_in(perturbation.settings, value), source)
-    commands = neutral_commands(env)
+    goals = neutral_goals(env)
     if perturbation.trained_ranges:
         sampled = training.config.randomization
-        commands = command_ranges(training.config)
+        goals = goal_ranges(training.config)
     else:
         terms = {name: getattr(world.randomization, name) for name in world.randomization.terms}
         for name, entry in _fill_in(perturbation.terms, value).items():
             low, high = _ends(entry, source)
-            if name in env.commands:
-                command = env.commands[name]
+            if name in env.goals:
+                goal = env.goals[name]
                 label = f"{source}: {name}"
-                commands[name] = command.checked(low, label), command.checked(high, label)
+                goals[name] = goal.checked(low, label), goal.checked(high, label)
                 if low > high:
                     raise UserError(f"{label} is from {low} to {high}; exchange the two")
             else:
@@ -273,7 +273,7 @@ def _condition(
         others = RandomizationConfig().model_dump()
         settings = dict(env) | {"randomization": others | terms}
         sampled = validate(type(env), settings, source).randomization
-    ends = {name: getattr(sampled, name) for name in sampled.terms} | commands
+    ends = {name: getattr(sampled, name) for name in sampled.terms} | goals
     ranges = {
         name: _broadcast(name, env.num_joints, low, high) for name, (low, high) in ends.items()
     }
@@ -306,9 +306,9 @@ class _Training(NamedTuple):
         return all(self._contains(name, bounds) for name, bounds in needed.items())
 
     def _contains(self, name: str, bounds: Bounds) -> bool:
-        """Whether it contains the range of a term or of a command."""
-        if name in self.config.commands:
-            return _is_within(bounds, command_ranges(self.config)[name])
+        """Whether it contains the range of a term or of a goal."""
+        if name in self.config.goals:
+            return _is_within(bounds, goal_ranges(self.config)[name])
         randomization = self.config.randomization
         sampled = getattr(randomization, name)
         if sampled is None:
@@ -322,7 +322,7 @@ class _Training(NamedTuple):
 
 
 def _unrandomized(config: WorldConfig) -> WorldConfig:
-    return config.model_copy(update={"randomization": RandomizationConfig()})
+    return config.in_world(RandomizationConfig())
 
 
 def _with_changes(env: WorldConfig, settings: dict[str, Any], source: str) -> WorldConfig:
@@ -358,7 +358,7 @@ def _ends(entry: Any, source: str) -> tuple[Any, Any]:
 
 def _broadcast(term: str, num_joints: int, low: Any, high: Any) -> Bounds:
     """Ends of a range in the term's shape."""
-    # A command is a number.
+    # A goal is a number.
     shape = TERMS[term].shape(num_joints) if term in TERMS else ()
     return tuple(np.broadcast_to(np.asarray(end, np.float64), shape) for end in (low, high))
 

@@ -278,10 +278,10 @@ class SimulatedArm:
         shape = (len(self.balls), 3)
         noise = config.reset.ball_position * self.random.uniform(-1.0, 1.0, shape)
         draws = jnp.asarray(self.random.uniform(size=self._task.num_draws))
-        commands = {}
-        for name, command in config.commands.items():
-            commands[name] = jnp.asarray(0.5 * (command.low + command.high))
-        thrown = self._task.throw(draws, commands)
+        goals = {}
+        for name, goal in config.goals.items():
+            goals[name] = jnp.asarray(0.5 * (goal.low + goal.high))
+        thrown = self._task.throw(draws, goals)
         if thrown is None:
             apart = BALLS_APART * np.arange(len(self.balls))[:, None] * [0.0, 0.0, 1.0]
             thrown = np.array(config.ball_init_pos) + apart, np.zeros(shape)
@@ -357,8 +357,8 @@ def goals_in_turn(
     """What a task asks for over time: the values that are given, one after another, or the middle,
     the upper end and the lower end of the range, each for a time (s)."""
     turns: dict[str, Sequence[float]] = {}
-    for name, command in config.commands.items():
-        ends = (0.5 * (command.low + command.high), command.high, command.low)
+    for name, goal in config.goals.items():
+        ends = (0.5 * (goal.low + goal.high), goal.high, goal.low)
         turns[name] = given.get(name) or ends
 
     def goals(time: float) -> dict[str, float]:

@@ -21,9 +21,9 @@ from bounce_mjx.runs.config import (
     code_of,
     load_run_config,
 )
-from bounce_mjx.runs.files import MANIFEST_FILE
 from bounce_mjx.runs.presets import read_config_file
 from bounce_mjx.runs.progress import load_results
+from bounce_mjx.runs.storage import MANIFEST_FILE
 from bounce_mjx.task.task import Curve
 
 # Settings that may differ within a group: the seed, and what may differ within a run.

@@ -86,9 +86,9 @@ def failures_figure(associations: Sequence[Association]) -> Figure:
 
 
 def _value(failure: Failure, name: str) -> float:
-    """A failed episode's value of a command, of a term, or of an entry of a term."""
-    if name in failure.command:
-        return failure.command[name]
+    """A failed episode's value of a goal, of a term, or of an entry of a term."""
+    if name in failure.goal:
+        return failure.goal[name]
     term, _, index = name.partition("[")
     value = np.ravel(failure.world[term])
     return float(value[int(index.rstrip("]")) if index else 0])

@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
+from bounce_mjx.env.contract import ENDS
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.statistics import paddle_points
@@ -26,6 +27,7 @@ from bounce_mjx.task.task import Curve, Histogram, Hits, Recording
 RETURN = "episode/return"
 """Tag of the return in a training's log."""
 _REWARD = "reward/"
+_METRIC = "task/"
 _GREY = "#777777"
 _STYLE = {
     "font.size": 9,
@@ -66,7 +68,8 @@ class RunPlot(NamedTuple):
 
 @style()
 def curves_figure(groups: Sequence[Group], columns: int = 3) -> Figure:
-    """The return and the curves of the task over the training, with points for evaluations.
+    """The return, the curves of the task, and the mean of each metric that none of them names, over
+    the training, with points for evaluations.
 
     Args:
       columns: most panels side by side.
@@ -74,6 +77,7 @@ def curves_figure(groups: Sequence[Group], columns: int = 3) -> Figure:
     shown = [Curve(RETURN, "", title="return of an episode")]
     for group in groups:
         shown += [curve for curve in group.task_curves if curve.title and curve not in shown]
+    shown += _unnamed_curves(groups)
     figure = _draw_curves(groups, shown, columns, height=2.4)
     for axes in figure.axes:
         _begin_at_zero(axes)
@@ -135,17 +139,30 @@ def reward_panels(groups: Sequence[Group]) -> dict[str, Figure]:
 
 def _reward_curves(groups: Sequence[Group]) -> list[Curve]:
     """The reward terms that any of the runs has logged."""
-    # Without repetitions, in their order.
-    logged: dict[str, None] = {}
+    return [_curve_of(tag, _REWARD) for tag in _logged(groups) if tag.startswith(_REWARD)]
+
+
+def _unnamed_curves(groups: Sequence[Group]) -> list[Curve]:
+    """The metrics of the tasks that any of the runs has logged and no curve of a task names."""
+    named = {f"{_METRIC}{end}" for end in ENDS}
+    for group in groups:
+        named |= {curve.tag for curve in group.task_curves}
+    tags = [tag for tag in _logged(groups) if tag.startswith(_METRIC) and tag not in named]
+    return [_curve_of(tag, _METRIC) for tag in tags]
+
+
+def _logged(groups: Sequence[Group]) -> list[str]:
+    """What any of the runs has logged, without repetitions, in its order."""
+    tags: dict[str, None] = {}
     for group in groups:
         for run in group.runs:
-            logged |= dict.fromkeys(run.curves)
-    curves = []
-    for name in logged:
-        if name.startswith(_REWARD):
-            title = name.removeprefix(_REWARD).replace("_", " ")
-            curves.append(Curve(tag=name, metric="", title=title))
-    return curves
+            tags |= dict.fromkeys(run.curves)
+    return list(tags)
+
+
+def _curve_of(tag: str, prefix: str) -> Curve:
+    """The curve of a mean over steps, whose title is the tag without its prefix."""
+    return Curve(tag=tag, metric="", title=tag.removeprefix(prefix).replace("_", " "))
 
 
 @style()
@@ -273,8 +290,8 @@ def _draw_heights(axes: Axes, env: Env, recording: Recording) -> None:
     time = env.dt * (1 + np.arange(steps))
     levels = []
     for step in range(steps):
-        command = {name: float(values[step, 0]) for name, values in recording.command.items()}
-        levels.append(env.task.levels(command))
+        goal = {name: float(values[step, 0]) for name, values in recording.goal.items()}
+        levels.append(env.task.levels(goal))
     for i, name in enumerate(levels[0]):
         heights = [level[name] for level in levels]
         constant = f" {heights[0]:.2f} m" if len(set(heights)) == 1 else ""

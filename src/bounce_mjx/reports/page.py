@@ -22,10 +22,10 @@ from bounce_mjx.reports.robustness import load_robustness, robustness_figure
 from bounce_mjx.reports.tables import details_line, result_cells
 from bounce_mjx.runs.checkpoints import read_actor
 from bounce_mjx.runs.config import load_run_config
-from bounce_mjx.runs.files import write_output
 from bounce_mjx.runs.folders import best_checkpoint
 from bounce_mjx.runs.progress import load_results
 from bounce_mjx.runs.records import Checkpoint
+from bounce_mjx.runs.storage import write_output
 from bounce_mjx.task.task import Recording
 from bounce_mjx.viewers.page import replay_first_and_worst, worst_episode
 

@@ -19,7 +19,7 @@ from bounce_mjx.evaluation.robustness import ConditionOutcome, RobustnessReport
 from bounce_mjx.evaluation.suite import NOMINAL, strength_text
 from bounce_mjx.reports.figures import PANEL_WIDTH, style
 from bounce_mjx.reports.tables import figure_text, plain_table
-from bounce_mjx.runs.files import read_stored
+from bounce_mjx.runs.storage import read_stored
 
 ROBUSTNESS_FILE = "robustness.json"
 

@@ -113,15 +113,10 @@ def unsolved_line(report: Report, num_seeds: int = 1) -> str:
             missed.append(f"{result.name} {result_text(result)} ({result.bound})")
     if not missed:
         return ""
-    stuck = "the seed is in a local optimum: try --seed or --num-seeds 8"
-    if num_seeds > 1:
-        stuck = (
-            f"each of the {num_seeds} seeds is in a local optimum: try others (--seed), or change "
-            "the reward"
-        )
+    others = "other seeds (--seed, --num-seeds 8)" if num_seeds == 1 else "other seeds (--seed)"
     return (
-        f"not solved: {', '.join(missed)}; if the return still rises (bounce-mjx plot), train "
-        f"longer; if not, {stuck}"
+        f"not solved: {', '.join(missed)}; train longer while the return rises (bounce-mjx plot); "
+        f"once it does not, {others} or another reward may help"
     )
 
 

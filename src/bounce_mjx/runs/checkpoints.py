@@ -45,8 +45,8 @@ from bounce_mjx.runs.config import (
     runs_folder,
     without_own_settings,
 )
-from bounce_mjx.runs.files import plain_path, seal, to_plain
 from bounce_mjx.runs.records import RECORD, Checkpoint, DamagedCheckpoint, Record, verify
+from bounce_mjx.runs.storage import plain_path, seal, to_plain
 from bounce_mjx.task.registry import DEFAULT
 
 POLICY = "policy"

@@ -16,8 +16,8 @@ from bounce_mjx.evaluation.config import DEFAULT_SEED
 from bounce_mjx.learning.config import PPO_NAME, PPOConfig
 from bounce_mjx.learning.registry import own_algorithm
 from bounce_mjx.robot.config import is_packaged
-from bounce_mjx.runs.files import check_integrity
 from bounce_mjx.runs.presets import BASE, SOURCES, read_config_file
+from bounce_mjx.runs.storage import check_integrity
 from bounce_mjx.task.registry import DEFAULT, find_task, is_task, task_name
 from bounce_mjx.task.task import Task
 from bounce_mjx.world.config import WorldConfig

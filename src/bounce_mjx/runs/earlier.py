@@ -30,6 +30,8 @@ _MOVED = {
     "env.joint_velocity_noise": "env.reset.joint_velocities",
     "env.ball_position_noise": "env.reset.ball_position",
     "ppo.min_noise_std": "ppo.mean_noise_bound",
+    "env.randomization.command_interval": "env.randomization.goal_interval",
+    "env.randomization.first_command_range": "env.randomization.first_goal_range",
 }
 """Settings that moved, with their present keys."""
 

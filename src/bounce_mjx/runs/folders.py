@@ -30,7 +30,7 @@ import itertools
 import os
 import re
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -49,10 +49,10 @@ from bounce_mjx.resources import (
 )
 from bounce_mjx.runs import earlier
 from bounce_mjx.runs.config import CONFIG_FILE, ROBOT, TrainConfig, dump_sources, runs_folder
-from bounce_mjx.runs.files import seal, writable, write_atomically
 from bounce_mjx.runs.presets import BASE
 from bounce_mjx.runs.progress import load_results
 from bounce_mjx.runs.records import Checkpoint, DamagedCheckpoint, Record, verify
+from bounce_mjx.runs.storage import seal, writable, write_atomically
 from bounce_mjx.task.registry import DEFAULT, find_task, own_task
 
 LATEST = "latest"
@@ -199,7 +199,7 @@ def lock_run(run: Path) -> Iterator[None]:
         os.close(descriptor)
 
 
-def find_run(path: Path) -> Path:
+def run_of(path: Path) -> Path:
     """Folder of the run that contains a path; the path may be the folder itself."""
     # Unlike os.path.isdir, Path.is_dir raises an error for a name that is too long.
     if not os.path.isdir(path):
@@ -221,7 +221,7 @@ def is_newest(path: Path | None) -> bool:
     return path is None or (str(path) == LATEST and not os.path.isdir(path))
 
 
-def named_run(path: Path | None, log_dir: Path) -> Path:
+def run_or_newest(path: Path | None, log_dir: Path) -> Path:
     """A run's folder or a path in it, as the user named it; in place of `is_newest`, the newest run
     with a checkpoint in `log_dir`."""
     if not is_newest(path):
@@ -252,7 +252,7 @@ def find_checkpoint(path: str | Path) -> Checkpoint:
         of checkpoints in it, or a checkpoint.
     """
     path = Path(path)
-    run = find_run(path)
+    run = run_of(path)
     if os.path.samefile(path, run):
         path = run = _best_seed(run)
     return best_checkpoint(run, path)
@@ -350,41 +350,34 @@ def pretrained_checkpoint(name: str = PRETRAINED) -> Checkpoint:
     return best_checkpoint(resource_path(POLICIES[name]))
 
 
-def choose_checkpoint(path: Path | None, log_dir: Path) -> Checkpoint:
-    """Checkpoint to show or to evaluate; prints the choice if the user made none: see
-    `find_choice`."""
-    checkpoint, choice = find_choice(path, log_dir)
-    if choice is not None:
-        print(choice)
-    return checkpoint
-
-
-def find_choice(path: Path | None, log_dir: Path) -> tuple[Checkpoint, str | None]:
-    """Checkpoint that a path stands for, and a line about the choice if the user made none.
+def choose_checkpoint(
+    path: Path | None, log_dir: Path, tell: Callable[[str], None] = print
+) -> Checkpoint:
+    """Checkpoint that a path stands for, to show or to evaluate.
 
     Args:
       path: see `find_checkpoint`; or `LATEST` or a name in `POLICIES`, unless there is a folder
         with that name. For None, the newest run in `log_dir`, or the package's policy of a task
         whose default folder of runs is empty.
+      tell: gets a line about the choice if the user made none.
     """
     if policy_folder(path):
-        return pretrained_checkpoint(str(path)), None
+        return pretrained_checkpoint(str(path))
     try:
-        run = named_run(path, log_dir)
+        run = run_or_newest(path, log_dir)
     except UserError:
         policy = _policy_of_folder(log_dir)
         if path is not None or policy is None:
             raise
-        choice = f"no run in {log_dir}: using the policy that comes with the package"
-        return pretrained_checkpoint(policy), choice
+        tell(f"no run in {log_dir}: using the policy that comes with the package")
+        return pretrained_checkpoint(policy)
     if not os.path.isdir(run) and (near := suggest(str(path), POLICIES)):
         raise UserError(f"there is no checkpoint folder and no policy {path}; {near}")
-    choice = None
     if run != path:
         results = load_results(_best_seed(run))
         known = results.best.summary if results else "not evaluated"
-        choice = f"using the newest run: {run} ({known})"
-    return find_checkpoint(run), choice
+        tell(f"using the newest run: {run} ({known})")
+    return find_checkpoint(run)
 
 
 def _policy_of_folder(log_dir: Path) -> str | None:

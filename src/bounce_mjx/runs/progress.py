@@ -7,7 +7,7 @@ from typing import Any
 import pydantic
 
 from bounce_mjx.evaluation.results import Report
-from bounce_mjx.runs.files import read_stored
+from bounce_mjx.runs.storage import read_stored
 
 RESULTS_FILE = "results.json"
 

@@ -12,7 +12,7 @@ import pydantic
 from bounce_mjx.errors import UserError, reason_of, shorten, warn_once
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.runs import earlier
-from bounce_mjx.runs.files import MANIFEST_FILE, check_integrity
+from bounce_mjx.runs.storage import MANIFEST_FILE, check_integrity
 
 RECORD = "record"
 """Item of a checkpoint with its `Record`."""

@@ -120,14 +120,14 @@ def beside_run(run: str | os.PathLike, name: str) -> UserError:
 
 def _start_of_run(word: Path, log_dir: Path | None) -> Start:
     """The start of a run that is resumed."""
-    from bounce_mjx.runs.folders import find_run, is_newest, named_run
+    from bounce_mjx.runs.folders import is_newest, run_of, run_or_newest
 
     if log_dir is not None and not is_newest(word):
         raise UserError(
             f"log_dir is where the newest run is looked for, and {word} is named; omit one of them"
         )
-    place = named_run(word, log_dir or runs_folder(find_task(DEFAULT)))
-    run = find_run(place)
+    place = run_or_newest(word, log_dir or runs_folder(find_task(DEFAULT)))
+    run = run_of(place)
     config = load_run_config(run)
     classes: dict[str, type] = {"task": config.env.task}
     if config.algorithm != PPO_NAME:
@@ -157,11 +157,12 @@ def _start_of_run(word: Path, log_dir: Path | None) -> Start:
 def _policy_of(path: Path, log_dir: Path) -> tuple[Path, TrainConfig, tuple[str, ...]]:
     """The policy of a warm start: its name or its checkpoint's folder, the config of its run, and
     which run latest stands for."""
-    from bounce_mjx.runs.folders import find_choice
+    from bounce_mjx.runs.folders import choose_checkpoint
 
-    checkpoint, note = find_choice(path, log_dir)
+    notes: list[str] = []
+    checkpoint = choose_checkpoint(path, log_dir, notes.append)
     start = path if policy_folder(path) else checkpoint.folder
-    return start, load_run_config(checkpoint.run), () if note is None else (note,)
+    return start, load_run_config(checkpoint.run), tuple(notes)
 
 
 def _folder_of_runs(

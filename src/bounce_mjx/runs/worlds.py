@@ -93,9 +93,9 @@ def trained_in(trained: WorldConfig, world: str | os.PathLike | None) -> WorldCo
     if world is None:
         return trained
     if world == NOMINAL:
-        return trained.model_copy(update={"randomization": RandomizationConfig()})
+        return trained.in_world(RandomizationConfig())
     if world == TRAINING:
-        ended = {"warmup_steps": 0, "first_command_range": 1.0}
+        ended = {"warmup_steps": 0, "first_goal_range": 1.0}
         randomization = trained.randomization.model_copy(update=ended)
         return trained.model_copy(update={"randomization": randomization})
     return in_named_world(trained, Path(world))[0]
@@ -114,7 +114,7 @@ def in_named_world(trained: WorldConfig, world: Path) -> tuple[WorldConfig, Name
     del values["randomization"]
     if named.robot is not None:
         values = merged(values, _layer_of_same_robot(trained, named, path).values["env"])
-    values = merged(values, named.settings)
+    values = merged(values, _settings_for(type(trained).task, named))
     return validate(type(trained), values, f"the world {shown_file(path)}", "env"), named
 
 
@@ -126,7 +126,7 @@ def in_sampled_world(trained: WorldConfig, randomization: RandomizationConfig) -
       UserError: a term does not fit the arm, or what is given has no term to act on.
     """
     if randomization.terms:
-        given = dict(trained) | {"randomization": randomization}
+        given = dict(trained.in_world(randomization))
         return validate(type(trained), given, "the flags --randomization")
     if randomization != RandomizationConfig():
         raise UserError(
@@ -140,8 +140,19 @@ def _layer_of_world(task: type[Task], world: NamedWorld, path: Path) -> Layer:
     """A named world's settings. Its randomisation is the whole one, but for the curriculum, which
     describes the training: a term that it does not have is as in the task."""
     default = task.Config().randomization.model_dump(exclude=set(CURRICULUM))
-    values = merged({"env": {"randomization": default}}, {"env": world.settings})
+    values = merged({"env": {"randomization": default}}, {"env": _settings_for(task, world)})
     return Layer(f"the world {shown_file(path)}", values, is_world=True)
+
+
+def _settings_for(task: type[Task], world: NamedWorld) -> dict[str, Any]:
+    """A named world's settings of `env`, without how well a person drops the ball if the task's
+    ball is not dropped."""
+    settings = world.settings
+    randomization = settings.get("randomization", {})
+    if task.ball_dropped or "ball_start" not in randomization:
+        return settings
+    others = {key: value for key, value in randomization.items() if key != "ball_start"}
+    return settings | {"randomization": others}
 
 
 def robot_in_world(robot: Path, world: Path) -> str:

@@ -61,7 +61,7 @@ from bounce_mjx.task.task import (
 from bounce_mjx.world.config import (
     PADDLE_HOME,
     ActionConfig,
-    Command,
+    Goal,
     NumBalls,
     ResetConfig,
     WorldConfig,

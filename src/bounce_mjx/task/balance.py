@@ -1,4 +1,4 @@
-"""Balancing: the ball rests on the paddle and follows a commanded point on it, despite pushes."""
+"""Balancing: the ball rests on the paddle and follows a target point on it, despite pushes."""
 
 from __future__ import annotations
 
@@ -48,9 +48,9 @@ class Rewards(task.StrictModel):
 class Observation(task.ObservationConfig):
     """The world's quantities, and the point."""
 
-    point_x: Annotated[task.History, task.Quantity(1, "m", "command")] = 1
+    point_x: Annotated[task.History, task.Quantity(1, "m", "goal")] = 1
     """Point on the paddle, from its centre along the world's x."""
-    point_y: Annotated[task.History, task.Quantity(1, "m", "command")] = 1
+    point_y: Annotated[task.History, task.Quantity(1, "m", "goal")] = 1
     """The same along the world's y."""
 
 
@@ -93,10 +93,10 @@ class Config(task.WorldConfig):
         )
 
     @property
-    def commands(self) -> dict[str, task.Command]:
+    def goals(self) -> dict[str, task.Goal]:
         """The point from the paddle's centre along the world's x and y, and its speed."""
-        coordinate = task.Command(-REACH, REACH, "m", least=-REACH, greatest=REACH, step=0.005)
-        speed = task.Command(
+        coordinate = task.Goal(-REACH, REACH, "m", least=-REACH, greatest=REACH, step=0.005)
+        speed = task.Goal(
             -MAX_SPEED,
             MAX_SPEED,
             "m/s",
@@ -117,10 +117,11 @@ class Balance(task.Task):
     curves = (task.Curve("task/error", "error", title="ball to point, cm", scale=100.0),)
     num_draws = 4
     ball_thrown = False
+    ball_dropped = False
 
     # The start.
 
-    def throw(self, draws: jax.Array, command: task.Values) -> tuple[jax.Array, jax.Array]:
+    def throw(self, draws: jax.Array, goal: task.Values) -> tuple[jax.Array, jax.Array]:
         """The ball lies still within half the reach of `ball_init_pos`, higher where a larger ball
         would be within the paddle."""
         x, y, z = self.config.ball_init_pos
@@ -137,23 +138,23 @@ class Balance(task.Task):
 
     # The point.
 
-    def next_command(self, centre: jax.Array, command: task.Values) -> task.Values:
+    def next_goal(self, centre: jax.Array, goal: task.Values) -> task.Values:
         """The point turns about its sampled centre, from where it is or a user has set it, and
         stays within reach."""
-        arm = _point(command) - centre
-        way = command["point_speed"] * self.config.control_dt
+        arm = _point(goal) - centre
+        way = goal["point_speed"] * self.config.control_dt
         angle = way / jnp.maximum(task.length(arm), MIN_RADIUS)
         sideways = jnp.stack([-arm[1], arm[0]])
         point = centre + jnp.cos(angle) * arm + jnp.sin(angle) * sideways
         x, y = point * REACH / jnp.maximum(task.length(point), REACH)
-        return command | {"point_x": x, "point_y": y}
+        return goal | {"point_x": x, "point_y": y}
 
     # A control step: reward, end, metrics.
 
     def step(self, centre: jax.Array, step: task.Step) -> task.TaskStep:
         truth = step.truth
         offset = truth.ball_position - truth.paddle_position
-        point_error = task.length(offset[:2] - _point(step.command))
+        point_error = task.length(offset[:2] - _point(step.goal))
         home = jnp.array(self.geometry.paddle_home)
         return task.TaskStep(
             state=centre,
@@ -196,7 +197,7 @@ class Balance(task.Task):
 
     # What is shown.
 
-    def markers(self, command: Any, metrics: Any) -> tuple[task.Marker, ...]:
+    def markers(self, goal: Any, metrics: Any) -> tuple[task.Marker, ...]:
         """A frame around the ball at the point."""
         x, y, z = self.focus()
         radius = self.geometry.ball_radius
@@ -204,14 +205,14 @@ class Balance(task.Task):
         return (
             task.Marker(
                 "point",
-                position=(x + command["point_x"], y + command["point_y"], face + 0.0005),
+                position=(x + goal["point_x"], y + goal["point_y"], face + 0.0005),
                 size=(radius + 0.002, radius + 0.002, 0.001),
                 rgba=(0.15, 0.9, 0.3, 0.9),
                 shape="frame",
             ),
         )
 
-    def readings(self, command: dict[str, float], metrics: dict[str, float]) -> dict[str, str]:
+    def readings(self, goal: dict[str, float], metrics: dict[str, float]) -> dict[str, str]:
         return {"from the point": f"{1000.0 * metrics['error']:.0f} mm"}
 
     def focus(self) -> tuple[float, float, float]:
@@ -219,6 +220,6 @@ class Balance(task.Task):
         return self.geometry.paddle_home
 
 
-def _point(command: task.Values) -> jax.Array:
+def _point(goal: task.Values) -> jax.Array:
     """The point from the paddle's centre [2], m."""
-    return jnp.stack([command["point_x"], command["point_y"]])
+    return jnp.stack([goal["point_x"], goal["point_y"]])

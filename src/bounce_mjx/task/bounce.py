@@ -57,7 +57,7 @@ class Observation(task.ObservationConfig):
     """The quantities that the policy sees, and how many values of each: 0 for none, 1 for the
     newest, N for the last N, the newest first."""
 
-    target_height: Annotated[task.History, task.Quantity(1, "m", "command")] = 1
+    target_height: Annotated[task.History, task.Quantity(1, "m", "goal")] = 1
     """Target height."""
     apex_error: Annotated[task.History, task.Quantity(1, "m")] = 0
     """Highest measured ball position minus the target height, of the flights before the last
@@ -157,13 +157,13 @@ class Config(task.WorldConfig):
         return farthest, 2.0 * fall_speed
 
     @property
-    def commands(self) -> dict[str, task.Command]:
+    def goals(self) -> dict[str, task.Goal]:
         """The target height."""
         lowest, highest = self.target_height_range
         lowest_offered, highest_offered = OFFERED_TARGETS
         heights = task.target_heights(self.limits, start=self.ball_init_pos[2])
         return {
-            "target_height": task.Command(
+            "target_height": task.Goal(
                 lowest,
                 highest,
                 "m",
@@ -208,7 +208,7 @@ class MeasuredFlight(NamedTuple):
 
 
 class Bounce(task.Task):
-    """The ball bounces on the paddle at the commanded height."""
+    """The ball bounces on the paddle at the target height."""
 
     Config = Config
     config: Config
@@ -242,7 +242,7 @@ class Bounce(task.Task):
         config = self.config
         truth = step.truth
         ball = truth.ball_position
-        target = step.command["target_height"]
+        target = step.goal["target_height"]
         after, bounced = self.detect(state, step)
         inputs = RewardInputs(
             ball_position=ball,
@@ -288,7 +288,7 @@ class Bounce(task.Task):
         rising = truth.ball_velocity[2] > config.bounce_min_velocity
         near = jnp.abs(height - truth.paddle_position[2]) < config.bounce_max_distance
         bounced = rising & ~state.rising & near
-        continues = state.apex > step.command["target_height"] - config.apex_tolerance
+        continues = state.apex > step.goal["target_height"] - config.apex_tolerance
         counted = jnp.where(continues, state.n_bounces + 1.0, 1.0)
         after = State(
             rising=rising,
@@ -361,7 +361,7 @@ class Bounce(task.Task):
         # Between two steps, so that rounding does not decide.
         settling = SETTLING_SECONDS + 0.5 * self.config.control_dt
         settled = moment.seconds > settling
-        judged = bounced & (moment.command_seconds > settling)
+        judged = bounced & (moment.goal_seconds > settling)
         centred = jnp.abs(x - self.config.reward.target_x) <= MAX_X_ERROR
         accurate = metrics["apex_error"] <= MAX_APEX_ERROR
         return task.Tally(
@@ -428,7 +428,7 @@ class Bounce(task.Task):
         lift = self.config.home_lift
         lowest = round(UPWARD_SPEED_TARGETS[0] + lift, 4)
         highest = round(UPWARD_SPEED_TARGETS[1] + lift, 4)
-        lowest_target, highest_target = episodes.commands["target_height"]
+        lowest_target, highest_target = episodes.goals["target_height"]
         if lowest <= lowest_target and highest_target <= highest:
             return ""
         return f"targets {lowest} to {highest} only"
@@ -448,7 +448,7 @@ class Bounce(task.Task):
         """Apex errors, and where the ball hits the paddle, of the bounces that the result `height`
         judges."""
         bounced = (recording.metrics["bounced"] > 0) & recording.running
-        bounces = bounced & self._has_settled(recording.command["target_height"])
+        bounces = bounced & self._has_settled(recording.goal["target_height"])
         errors = 100.0 * recording.metrics["apex_offset"][bounces]
         return (
             task.Histogram(
@@ -470,14 +470,14 @@ class Bounce(task.Task):
         last_change = np.maximum.accumulate(np.where(is_new, steps, -1), axis=0)
         return steps - last_change > round(SETTLING_SECONDS / self.config.control_dt)
 
-    def markers(self, command: dict[str, float], metrics: Any) -> tuple[task.Marker, ...]:
+    def markers(self, goal: dict[str, float], metrics: Any) -> tuple[task.Marker, ...]:
         """A disc at the target height, and the outline of the paddle's home."""
         home = self.focus()
         x, y, _ = home
         return (
             task.Marker(
                 "target_height",
-                position=(x, y, command["target_height"]),
+                position=(x, y, goal["target_height"]),
                 size=(0.05, 0.001, 0.0),
                 rgba=(0.15, 0.9, 0.3, 0.4),
                 shape="cylinder",
@@ -491,11 +491,11 @@ class Bounce(task.Task):
             ),
         )
 
-    def readings(self, command: dict[str, float], metrics: dict[str, float]) -> dict[str, str]:
+    def readings(self, goal: dict[str, float], metrics: dict[str, float]) -> dict[str, str]:
         """Bounces in a row, and the target height."""
         return {
             "bounces": f"{metrics['n_bounces']:.0f}",
-            "target": f"{command['target_height']:.2f} m",
+            "target": f"{goal['target_height']:.2f} m",
         }
 
     def focus(self) -> tuple[float, float, float]:

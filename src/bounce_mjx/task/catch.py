@@ -150,7 +150,7 @@ class Catch(task.Task):
 
     # The start.
 
-    def throw(self, draws: jax.Array, command: task.Values) -> tuple[jax.Array, jax.Array]:
+    def throw(self, draws: jax.Array, goal: task.Values) -> tuple[jax.Array, jax.Array]:
         """The throw starts at the height of its aim, so that the ball falls at 2.9 to 3.4 m/s."""
         x, y, z = self.config.ball_init_pos
         rest_height = self.geometry.paddle_home[2] + self.geometry.rest_height
@@ -252,7 +252,7 @@ class Catch(task.Task):
 
     # What is shown.
 
-    def markers(self, command: Any, metrics: Any) -> tuple[task.Marker, ...]:
+    def markers(self, goal: Any, metrics: Any) -> tuple[task.Marker, ...]:
         """A disc around the points at which throws aim."""
         return (
             task.Marker(
@@ -264,7 +264,7 @@ class Catch(task.Task):
             ),
         )
 
-    def readings(self, command: dict[str, float], metrics: dict[str, float]) -> dict[str, str]:
+    def readings(self, goal: dict[str, float], metrics: dict[str, float]) -> dict[str, str]:
         return {"caught": "yes" if metrics["caught"] else "no"}
 
     def focus(self) -> tuple[float, float, float]:

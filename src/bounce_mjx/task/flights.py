@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 GRAVITY = 9.81
 """Gravity in the tasks' ballistic formulas, m/s^2 (the simulated gravity is the MJCF's)."""
 SETTLING_SECONDS = 2.0
-"""Time since a reset or a sample of the commands after which apexes count, s."""
+"""Time since a reset or a sample of the goals after which apexes count, s."""
 MAX_HEIGHT_ERROR = 0.1
 """Largest distance of an accurate apex from the target height, m."""
 MIN_APEX_HEIGHT = 0.1

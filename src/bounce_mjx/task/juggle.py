@@ -1,4 +1,4 @@
-"""Juggling: balls bounce alternately at the commanded height on one paddle, each in a column."""
+"""Juggling: balls bounce alternately at the target height on one paddle, each in a column."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Rewards(task.StrictModel):
 class Observation(task.ObservationConfig):
     """The world's quantities, the height, and the next ball."""
 
-    target_height: Annotated[task.History, task.Quantity(1, "m", "command")] = 1
+    target_height: Annotated[task.History, task.Quantity(1, "m", "goal")] = 1
     next_ball: Annotated[task.History, task.Quantity(9)] = 1
     """Of the ball that lands next: its landing from the paddle and from the column (m), its
     horizontal velocity (m/s), its apex from the height (m), the time until it lands, and from then
@@ -96,13 +96,13 @@ class Config(task.WorldConfig):
         )
 
     @property
-    def commands(self) -> dict[str, task.Command]:
+    def goals(self) -> dict[str, task.Goal]:
         """The height of the apexes."""
         home_height = self.home[2]
         lowest, highest = self.height_range
         heights = task.target_heights(self.limits, min_flight=flights.MIN_TARGET_HEIGHT)
         return {
-            "target_height": task.Command(
+            "target_height": task.Goal(
                 home_height + lowest,
                 home_height + highest,
                 "m",
@@ -114,10 +114,10 @@ class Config(task.WorldConfig):
         }
 
     def columns(self, height: Any) -> list[tuple[Any, Any, Any]]:
-        """The top of each ball's column: its commanded apex (x, y, z), m.
+        """The top of each ball's column: its target apex (x, y, z), m.
 
         Args:
-          height: the commanded height [], m.
+          height: the target height [], m.
         """
         x, y, _ = self.home
         middle = 0.5 * (self.num_balls - 1)
@@ -125,7 +125,7 @@ class Config(task.WorldConfig):
 
 
 class Juggle(task.Task):
-    """Balls bounce alternately at the commanded height on one paddle, each in a column."""
+    """Balls bounce alternately at the target height on one paddle, each in a column."""
 
     Config = Config
     config: Config
@@ -144,7 +144,7 @@ class Juggle(task.Task):
         return flights.ground(self.config.home, self.geometry)
 
     def _columns(self, height: jax.Array) -> jax.Array:
-        """The tops of the columns [B, 3] at the commanded height [], m."""
+        """The tops of the columns [B, 3] at the target height [], m."""
         tops = []
         for x, y, z in self.config.columns(height):
             tops.append(jnp.stack([jnp.asarray(x), jnp.asarray(y), jnp.asarray(z)]))
@@ -169,9 +169,9 @@ class Juggle(task.Task):
                     f"and {radii[j]:.4g} m touch in columns that are {apart:g} m apart; give more"
                 )
 
-    def throw(self, draws: jax.Array, command: task.Values) -> tuple[jax.Array, jax.Array]:
+    def throw(self, draws: jax.Array, goal: task.Values) -> tuple[jax.Array, jax.Array]:
         """The balls are in their columns and land alternately, in the order of their numbers."""
-        height = command["target_height"]
+        height = goal["target_height"]
         period = self._period(height)
         count = self.config.num_balls
         # Share of a period that each ball has flown more than that of the highest number.
@@ -195,7 +195,7 @@ class Juggle(task.Task):
         rose, last_hit = state
         truth = step.truth
         balls = truth.ball_position
-        height = step.command["target_height"]
+        height = step.goal["target_height"]
         columns = self._columns(height)
         flight = task.flight(balls, truth.ball_velocity, self.ground)
 
@@ -288,7 +288,7 @@ class Juggle(task.Task):
 
     def tally(self, moment: task.Moment) -> task.Tally:
         metrics = moment.metrics
-        settled = moment.command_seconds > flights.SETTLING_SECONDS
+        settled = moment.goal_seconds > flights.SETTLING_SECONDS
         return task.Tally(
             sums={
                 "hits": metrics["hits"],
@@ -319,10 +319,10 @@ class Juggle(task.Task):
 
     # What is shown.
 
-    def markers(self, command: Any, metrics: Any) -> tuple[task.Marker, ...]:
+    def markers(self, goal: Any, metrics: Any) -> tuple[task.Marker, ...]:
         """A disc on top of each column, and a frame where the next ball lands."""
         markers = []
-        for number, top in enumerate(self.config.columns(command["target_height"]), start=1):
+        for number, top in enumerate(self.config.columns(goal["target_height"]), start=1):
             markers.append(
                 task.Marker(
                     f"target height {number}",
@@ -343,8 +343,8 @@ class Juggle(task.Task):
         )
         return tuple(markers)
 
-    def readings(self, command: dict[str, float], metrics: dict[str, float]) -> dict[str, str]:
-        return {"target": f"{command['target_height']:.2f} m"}
+    def readings(self, goal: dict[str, float], metrics: dict[str, float]) -> dict[str, str]:
+        return {"target": f"{goal['target_height']:.2f} m"}
 
 
 def _next(values: jax.Array, falls: jax.Array) -> jax.Array:

@@ -1,7 +1,7 @@
-"""A commanded point that moves along a path at a phase from 0 to 1, at a height that sways.
+"""A target point that moves along a path at a phase from 0 to 1, at a height that sways.
 
-Its commands are target_x, target_y and target_height (m), the point now; point_speed (m/s), its
-greatest horizontal speed; and those of `COMMANDS`.
+Its goals are target_x, target_y and target_height (m), the point now; point_speed (m/s), its
+greatest horizontal speed; and those of `GOALS`.
 """
 
 from __future__ import annotations
@@ -29,30 +29,30 @@ SHARPEST = 17.0 / 16.0
 max(sin^2 a + 4 sin^2 2a) = (17 / 8)^2 for its phase a, in radians."""
 SWAY = 0.05
 """Amplitude of the height, m."""
-COMMANDS = {
-    "path": task.Command(
+GOALS = {
+    "path": task.Goal(
         0.0, len(NAMES), least=0.0, greatest=len(NAMES), step=1.0, names=NAMES, hidden=True
     ),
-    "course": task.Command(0.0, 1.0, "turns", least=0.0, greatest=1.0, hidden=True),
-    "phase": task.Command(0.0, 1.0, "turns", least=0.0, greatest=1.0, hidden=True),
+    "course": task.Goal(0.0, 1.0, "turns", least=0.0, greatest=1.0, hidden=True),
+    "phase": task.Goal(0.0, 1.0, "turns", least=0.0, greatest=1.0, hidden=True),
 }
 """Number of the path; its direction, and the form of the wandering; the place on it."""
 
 Values = dict[str, Any]
 
 
-def point(command: Values, xp: Any = None) -> Any:
+def point(goal: Values, xp: Any = None) -> Any:
     """The point now [3, ...], m, in JAX or in another array library."""
-    return (xp or jnp).stack([command[f"target_{axis}"] for axis in ("x", "y", "height")])
+    return (xp or jnp).stack([goal[f"target_{axis}"] for axis in ("x", "y", "height")])
 
 
-def at_point(command: Values, point: Any) -> Values:
-    """The commands with another point now [3], m."""
+def at_point(goal: Values, point: Any) -> Values:
+    """The goals with another point now [3], m."""
     x, y, height = point
-    return command | {"target_x": x, "target_y": y, "target_height": height}
+    return goal | {"target_x": x, "target_y": y, "target_height": height}
 
 
-def offset(command: Values, size: float, phase: Any, xp: Any = None) -> Any:
+def offset(goal: Values, size: float, phase: Any, xp: Any = None) -> Any:
     """The point from the middle of its path [3, ...], m, at places on it [...], turns.
 
     Args:
@@ -60,7 +60,7 @@ def offset(command: Values, size: float, phase: Any, xp: Any = None) -> Any:
         most half the width of the wandering, m.
     """
     xp = xp or jnp
-    course = command["course"]
+    course = goal["course"]
 
     def sine(turns: Any) -> Any:
         return xp.sin(2.0 * math.pi * turns)
@@ -76,8 +76,8 @@ def offset(command: Values, size: float, phase: Any, xp: Any = None) -> Any:
     # In the order of the names, each of the size 1.
     xs = (cosine(phase), sine(phase), sine(phase), side * cosine(corner), wandering_x)
     ys = (sine(phase), 0.0 * phase, sine(2.0 * phase) / 2.0, side * sine(corner), wandering_y)
-    x = size * _choose(xs, command, xp)
-    y = size * _choose(ys, command, xp)
+    x = size * _choose(xs, goal, xp)
+    y = size * _choose(ys, goal, xp)
 
     # The course turns the path.
     cos_course = cosine(course)
@@ -87,27 +87,27 @@ def offset(command: Values, size: float, phase: Any, xp: Any = None) -> Any:
     return xp.stack([turned_x, turned_y, SWAY * sine(phase + course)])
 
 
-def phase_in(seconds: Any, command: Values, size: float) -> jax.Array:
+def phase_in(seconds: Any, goal: Values, size: float) -> jax.Array:
     """Place on the path in some seconds [], turns. Steps have their own time, unless the speed
     is 0."""
-    speed = command["point_speed"]
+    speed = goal["point_speed"]
     turns_a_second = [speed / (2.0 * math.pi * size * fastest) for fastest in FASTEST]
     turns_a_second[STEPS] = (speed > 0.0) / (CORNERS * STEP_SECONDS)
-    return command["phase"] + seconds * _choose(turns_a_second, command, jnp)
+    return goal["phase"] + seconds * _choose(turns_a_second, goal, jnp)
 
 
-def seconds_at_corner(command: Values) -> jax.Array:
+def seconds_at_corner(goal: Values) -> jax.Array:
     """Time since the last step of a point on the path of steps [], s."""
-    corners = CORNERS * command["phase"]
+    corners = CORNERS * goal["phase"]
     return (corners - jnp.floor(corners)) * STEP_SECONDS
 
 
-def markers(command: dict[str, float], size: float) -> tuple[task.Marker, ...]:
+def markers(goal: dict[str, float], size: float) -> tuple[task.Marker, ...]:
     """A disc at the point, and dots on its path."""
-    here = point(command, np)
-    here_from_middle = offset(command, size, command["phase"], np)
+    here = point(goal, np)
+    here_from_middle = offset(goal, size, goal["phase"], np)
     phases = np.linspace(0.0, 1.0, 24, endpoint=False)
-    dots = here + offset(command, size, phases, np).T - here_from_middle
+    dots = here + offset(goal, size, phases, np).T - here_from_middle
     markers = [
         task.Marker(
             "target point",
@@ -129,15 +129,15 @@ def markers(command: dict[str, float], size: float) -> tuple[task.Marker, ...]:
     return tuple(markers)
 
 
-def name(command: dict[str, float]) -> str:
+def name(goal: dict[str, float]) -> str:
     """Name of the path."""
-    return NAMES[min(int(command["path"]), len(NAMES) - 1)]
+    return NAMES[min(int(goal["path"]), len(NAMES) - 1)]
 
 
-def _choose(values: Any, command: Values, xp: Any) -> Any:
-    """The value that belongs to the command's path, of one for each path."""
+def _choose(values: Any, goal: Values, xp: Any) -> Any:
+    """The value that belongs to the goal's path, of one for each path."""
     # Not jnp.select, which is made with argmax: XLA for CPUs aborts where it fuses two of them.
     value, *others = values
     for number, other in enumerate(others, start=1):
-        value = xp.where(command["path"] >= number, other, value)
+        value = xp.where(goal["path"] >= number, other, value)
     return value

@@ -37,8 +37,8 @@ class Episodes(NamedTuple):
     """Greatest values over the steps of what `Task.tally` gave."""
     lasted: np.ndarray
     """Whether the episode lasted until its time limit, bool."""
-    commands: dict[str, tuple[float, float]]
-    """The range of each command in these episodes."""
+    goals: dict[str, tuple[float, float]]
+    """The range of each goal in these episodes."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,7 +83,7 @@ def share_of_episodes(name: str, measured: str, met: np.ndarray, least: float) -
     share = float(met.mean())
     return Result(
         name=name,
-        measured=f"{measured}, %",
+        measured=_in_percent(measured),
         value=100.0 * share,
         bound=f">= {100 * least:g}",
         passed=share >= least,
@@ -108,7 +108,7 @@ def share_of_events(
       UserError: the least share is not from 0 to 1.
     """
     _check_share(name, least)
-    share = mean_of_events(name, f"{measured}, %", met, events, (least, math.inf))
+    share = mean_of_events(name, _in_percent(measured), met, events, (least, math.inf))
     percentage = None if share.value is None else 100.0 * share.value
     return dataclasses.replace(share, value=percentage, bound=f">= {100 * least:g}")
 
@@ -183,6 +183,11 @@ def mean_and_margin(totals: np.ndarray, events: np.ndarray) -> tuple[float | Non
     mean = float(totals.sum() / count)
     spread = float((totals - mean * events).std() / events.mean())
     return mean, MARGIN_ERRORS * spread / math.sqrt(MARGIN_EPISODES)
+
+
+def _in_percent(measured: str) -> str:
+    """A description of a share with its unit at the end, also where it has that already."""
+    return f"{measured.removesuffix('%').rstrip(' ,')}, %"
 
 
 def _check_share(name: str, least: float) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
 from bounce_mjx.config.places import where_made
 from bounce_mjx.config.settings import is_finite
-from bounce_mjx.errors import UserError, shorten
+from bounce_mjx.errors import RENAMED, UserError, shorten
 from bounce_mjx.lazy import jax, jnp, np
 from bounce_mjx.task.results import Episodes, Figure, Result
 from bounce_mjx.world.config import WorldConfig
@@ -30,8 +30,8 @@ class Start(NamedTuple):
 
     truth: Kinematics
     """Positions and velocities after the reset."""
-    command: Values
-    """Value [] of each command."""
+    goal: Values
+    """Value [] of each goal."""
     draws: jax.Array
     """Uniform random numbers between 0 and 1 [num_draws]."""
 
@@ -41,8 +41,8 @@ class Step(NamedTuple):
 
     truth: Kinematics
     """Positions and velocities after the step."""
-    command: Values
-    """Value [] of each command during the step, which the policy saw as it chose the action."""
+    goal: Values
+    """Value [] of each goal during the step, which the policy saw as it chose the action."""
     action: jax.Array
     """Clipped action [n]."""
     last_action: jax.Array
@@ -73,16 +73,16 @@ class Moment(NamedTuple):
 
     truth: Kinematics
     """Positions and velocities after the step."""
-    command: Values
-    """Value [] of each command after the step; the metrics are of those during the step."""
+    goal: Values
+    """Value [] of each goal after the step; the metrics are of those during the step."""
     state: TaskState
     """The task's state after the step."""
     metrics: Values
     """The environment's metrics of the step, each []."""
     seconds: jax.Array
     """Time since the reset [], s."""
-    command_seconds: jax.Array
-    """Time since the commands were sampled [], s; at most `seconds`."""
+    goal_seconds: jax.Array
+    """Time since the goals were sampled [], s; at most `seconds`."""
 
 
 class Tally(NamedTuple):
@@ -117,8 +117,8 @@ class Recording(NamedTuple):
     """Ball positions after the step [T, 3, K], m."""
     paddle: jax.Array
     """Positions of the paddle's centre after the step [T, 3, K], m."""
-    command: dict[str, jax.Array]
-    """Commands after the step [T, K]."""
+    goal: dict[str, jax.Array]
+    """Goals after the step [T, K]."""
     running: jax.Array
     """Whether the episode had not ended before the step [T, K], bool."""
     terminated: jax.Array
@@ -204,7 +204,7 @@ class Task:
 
     Config: ClassVar[type[WorldConfig]]
     """The settings of an environment with this task: those of the world, and the task's own. It
-    overrides `commands`, `heights`, `ball_bounds` and `settings_at` of the world where the task
+    overrides `goals`, `heights`, `ball_bounds` and `settings_at` of the world where the task
     needs others; a field of its `observation` with a `Quantity` is a quantity of the task."""
     folder: ClassVar[str] = ""
     """Name of the folder of its runs in runs/; by default, the class's name in lower case."""
@@ -218,6 +218,9 @@ class Task:
     near it."""
     ball_thrown: ClassVar[bool] = True
     """Whether the ball may start elsewhere than over the paddle."""
+    ball_dropped: ClassVar[bool] = True
+    """Whether the ball starts in the air, where a person lets go of it; of a ball that lies on the
+    paddle, a named world's `ball_start` says nothing."""
     num_draws: ClassVar[int] = 0
     """Random numbers that a reset samples for the task."""
     critic_metrics: ClassVar[tuple[str, ...]] = ()
@@ -238,6 +241,13 @@ class Task:
                 f"the Config of the task {cls.__name__} is {shorten(repr(cls.Config))}; give a "
                 "class that extends task.WorldConfig"
             )
+        for kind in (cls, cls.Config):
+            overridden = [name for name in RENAMED if hasattr(kind, RENAMED[name])]
+            for name in vars(kind).keys() & set(overridden):
+                raise UserError(
+                    f"the task {cls.__name__} has {name}, which is {RENAMED[name]} today and would "
+                    "not be called; rename it"
+                )
         owner = vars(cls.Config).get("task")
         # The cell of a notebook may run again.
         if owner and (owner.__module__, owner.__qualname__) != (cls.__module__, cls.__qualname__):
@@ -269,14 +279,14 @@ class Task:
           UserError: it cannot.
         """
 
-    def throw(self, draws: jax.Array, command: Values) -> tuple[jax.Array, jax.Array] | None:
+    def throw(self, draws: jax.Array, goal: Values) -> tuple[jax.Array, jax.Array] | None:
         """Position [3] (m) and velocity [3] (m/s) of the ball at a reset, before the noise and the
         terms of the randomisation, of each ball [B, 3] if there are several; None for balls at rest
         at `ball_init_pos` and above it.
 
         Args:
           draws: uniform random numbers between 0 and 1 [num_draws].
-          command: value [] of each command, as it is sampled.
+          goal: value [] of each goal, as it is sampled.
         """
         return None
 
@@ -293,32 +303,32 @@ class Task:
         """
         raise self._lacking("step", "returns a task.TaskStep")
 
-    def first_command(self, command: Values) -> Values:
-        """The commands from a new sample, at a reset or within an episode, for a task in which a
+    def first_goal(self, goal: Values) -> Values:
+        """The goals from a new sample, at a reset or within an episode, for a task in which a
         sample is not what the policy has to follow, such as the middle of a path.
 
         Args:
-          command: value [] of each command, as it is sampled.
+          goal: value [] of each goal, as it is sampled.
         """
-        return command
+        return goal
 
-    def next_command(self, state: TaskState, command: Values) -> Values:
-        """The commands of the coming step, for a task whose commands move within an episode: those
+    def next_goal(self, state: TaskState, goal: Values) -> Values:
+        """The goals of the coming step, for a task whose goals move within an episode: those
         at its end, at which it is judged. It is called at a reset and after every step; at a reset
-        and at a redraw, on the result of `first_command`.
+        and at a redraw, on the result of `first_goal`.
 
         Args:
           state: the task's state after the step or the reset.
-          command: value [] of each command until now.
+          goal: value [] of each goal until now.
         """
-        return command
+        return goal
 
     def first_quantities(self, measured: Values) -> tuple[TaskState, Values]:
         """What the task remembers of the measurements at a reset, and the first value [size] of
         each quantity of the observation that is the task's own.
 
         Args:
-          measured: value [size] of each quantity of the world and of each command; of several
+          measured: value [size] of each quantity of the world and of each goal; of several
             balls [B, size].
         """
         return (), {}
@@ -352,9 +362,7 @@ class Task:
         """What a report draws of the first episodes of an evaluation, as NumPy arrays."""
         return ()
 
-    def markers(
-        self, command: dict[str, float], metrics: Mapping[str, float]
-    ) -> tuple[Marker, ...]:
+    def markers(self, goal: dict[str, float], metrics: Mapping[str, float]) -> tuple[Marker, ...]:
         """Shapes in the scene; the same names in the same order for all.
 
         Args:
@@ -362,12 +370,12 @@ class Task:
         """
         return ()
 
-    def levels(self, command: dict[str, float]) -> dict[str, float]:
+    def levels(self, goal: dict[str, float]) -> dict[str, float]:
         """Heights that a plot shows in addition to those of ball and paddle, m: a `target_height`
         by default."""
-        return {"target": command["target_height"]} if "target_height" in command else {}
+        return {"target": goal["target_height"]} if "target_height" in goal else {}
 
-    def readings(self, command: dict[str, float], metrics: dict[str, float]) -> dict[str, str]:
+    def readings(self, goal: dict[str, float], metrics: dict[str, float]) -> dict[str, str]:
         """What a viewer writes over an environment, by name; the first stands for all where there
         is little room."""
         return {}

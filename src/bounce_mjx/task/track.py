@@ -66,9 +66,9 @@ class Rewards(task.StrictModel):
 class Observation(task.ObservationConfig):
     """The world's quantities, the point, and where to aim."""
 
-    target_x: Annotated[task.History, task.Quantity(1, "m", "command")] = 1
-    target_y: Annotated[task.History, task.Quantity(1, "m", "command")] = 1
-    target_height: Annotated[task.History, task.Quantity(1, "m", "command")] = 1
+    target_x: Annotated[task.History, task.Quantity(1, "m", "goal")] = 1
+    target_y: Annotated[task.History, task.Quantity(1, "m", "goal")] = 1
+    target_height: Annotated[task.History, task.Quantity(1, "m", "goal")] = 1
     aim: Annotated[task.History, task.Quantity(2, "m")] = 1
     """From the flight's end to the point at the next apex, if the point keeps its acceleration."""
 
@@ -115,19 +115,19 @@ class Config(task.WorldConfig):
         return (x, y, z + lowest), (x, y, z + highest)
 
     @property
-    def commands(self) -> dict[str, task.Command]:
+    def goals(self) -> dict[str, task.Goal]:
         """The point, its speed and its path. The ranges of the point are those of the middle of the
-        path, which is sampled; the point itself leaves them (`first_command`)."""
+        path, which is sampled; the point itself leaves them (`first_goal`)."""
         x, y, z = self.home
         lowest, highest = self.height_range
         slowest, fastest = self.speed_range
         heights = task.target_heights(
             self.limits, min_flight=flights.MIN_TARGET_HEIGHT, sway=paths.SWAY
         )
-        commands = {
-            "target_x": task.Command(x - 0.02, x + 0.02, "m", span=(x - 0.15, x + 0.15), step=0.01),
-            "target_y": task.Command(y - 0.02, y + 0.02, "m", span=(y - 0.15, y + 0.15), step=0.01),
-            "target_height": task.Command(
+        goals = {
+            "target_x": task.Goal(x - 0.02, x + 0.02, "m", span=(x - 0.15, x + 0.15), step=0.01),
+            "target_y": task.Goal(y - 0.02, y + 0.02, "m", span=(y - 0.15, y + 0.15), step=0.01),
+            "target_height": task.Goal(
                 z + lowest,
                 z + highest,
                 "m",
@@ -137,11 +137,11 @@ class Config(task.WorldConfig):
                 setting="height_range",
                 reason=heights.reason,
             ),
-            "point_speed": task.Command(
+            "point_speed": task.Goal(
                 slowest, fastest, "m/s", least=0.0, span=(0.0, 0.3), hidden=True
             ),
         }
-        return commands | paths.COMMANDS
+        return goals | paths.GOALS
 
 
 class Track(task.Task):
@@ -163,29 +163,29 @@ class Track(task.Task):
 
     # The point.
 
-    def first_command(self, command: task.Values) -> task.Values:
+    def first_goal(self, goal: task.Values) -> task.Values:
         """The point on its path, whose middle is sampled."""
-        offset = paths.offset(command, self.config.path_size, command["phase"])
-        return paths.at_point(command, paths.point(command) + offset)
+        offset = paths.offset(goal, self.config.path_size, goal["phase"])
+        return paths.at_point(goal, paths.point(goal) + offset)
 
-    def next_command(self, state: Any, command: task.Values) -> task.Values:
+    def next_goal(self, state: Any, goal: task.Values) -> task.Values:
         """The path moves the point on from where it is, which a user may have set."""
         size = self.config.path_size
-        next_phase = paths.phase_in(self.config.control_dt, command, size)
-        offset = paths.offset(command, size, command["phase"])
-        next_offset = paths.offset(command, size, next_phase)
-        point = paths.point(command) + next_offset - offset
-        return paths.at_point(command, point) | {
-            "path": jnp.floor(command["path"]),
+        next_phase = paths.phase_in(self.config.control_dt, goal, size)
+        offset = paths.offset(goal, size, goal["phase"])
+        next_offset = paths.offset(goal, size, next_phase)
+        point = paths.point(goal) + next_offset - offset
+        return paths.at_point(goal, point) | {
+            "path": jnp.floor(goal["path"]),
             "phase": next_phase - jnp.floor(next_phase),
         }
 
-    def _point_in(self, seconds: jax.Array, command: task.Values) -> jax.Array:
+    def _point_in(self, seconds: jax.Array, goal: task.Values) -> jax.Array:
         """The point [3] in some seconds [], m, if the path moves it on."""
         size = self.config.path_size
-        offset = paths.offset(command, size, command["phase"])
-        later = paths.phase_in(seconds, command, size)
-        return paths.point(command) + paths.offset(command, size, later) - offset
+        offset = paths.offset(goal, size, goal["phase"])
+        later = paths.phase_in(seconds, goal, size)
+        return paths.point(goal) + paths.offset(goal, size, later) - offset
 
     # The start, and a control step: reward, end, metrics.
 
@@ -199,15 +199,15 @@ class Track(task.Task):
         rises = truth.ball_velocity[2] > 0.0
         flight = task.flight(ball, truth.ball_velocity, self.ground)
         is_apex = flights.is_apex(rose, rises, ball[2], self.config.home)
-        point = paths.point(step.command)
+        point = paths.point(step.goal)
         x_square, y_square, z_square = jnp.square(ball - point)
         return task.TaskStep(
             state=rises,
             reward=task.weighted_terms(
                 self.config.reward,
                 # Of an apex before a redraw, it is the point of the new path at that time.
-                apex=flights.apex_error(flight, self._point_in(flight.rise, step.command)),
-                landing=flights.landing_error(flight, self._point_in(flight.fall, step.command)),
+                apex=flights.apex_error(flight, self._point_in(flight.rise, step.goal)),
+                landing=flights.landing_error(flight, self._point_in(flight.fall, step.goal)),
                 paddle=(flight.end - truth.paddle_position)[:2],
                 home=truth.paddle_position[2] - self.config.home[2],
                 calm=task.changes(truth.joint_velocities, step.action, step.last_action),
@@ -270,11 +270,11 @@ class Track(task.Task):
     # The results.
 
     def tally(self, moment: task.Moment) -> task.Tally:
-        command = moment.command
+        goal = moment.goal
         error = moment.metrics["error"]
-        has_steps = command["path"] == paths.STEPS
-        has_settled = moment.command_seconds > flights.SETTLING_SECONDS
-        has_reached = paths.seconds_at_corner(command) > STEP_SETTLING_SECONDS
+        has_steps = goal["path"] == paths.STEPS
+        has_settled = moment.goal_seconds > flights.SETTLING_SECONDS
+        has_reached = paths.seconds_at_corner(goal) > STEP_SETTLING_SECONDS
 
         apex = (moment.metrics["apexes"] > 0) & has_settled
         after_step = apex & has_steps & has_reached
@@ -287,7 +287,7 @@ class Track(task.Task):
         # Whether the episode has what a result judges.
         is_judged = {"after steps": has_steps}
         for name, band in BANDS.items():
-            is_in_band = _is_in_band(command["point_speed"], band) & ~has_steps
+            is_in_band = _is_in_band(goal["point_speed"], band) & ~has_steps
             is_judged[name] = is_in_band
             sums[name] = apex & is_in_band
             sums[f"{name}^2"] = sums[name] * jnp.square(100.0 * error)
@@ -330,11 +330,11 @@ class Track(task.Task):
 
     # What is shown.
 
-    def markers(self, command: Any, metrics: Any) -> tuple[task.Marker, ...]:
-        return paths.markers(command, self.config.path_size)
+    def markers(self, goal: Any, metrics: Any) -> tuple[task.Marker, ...]:
+        return paths.markers(goal, self.config.path_size)
 
-    def readings(self, command: dict[str, float], metrics: dict[str, float]) -> dict[str, str]:
-        return {"path": f"{paths.name(command)}, {command['point_speed']:.2f} m/s"}
+    def readings(self, goal: dict[str, float], metrics: dict[str, float]) -> dict[str, str]:
+        return {"path": f"{paths.name(goal)}, {goal['point_speed']:.2f} m/s"}
 
 
 def _unless_longer(vector: jax.Array, limit: float) -> jax.Array:

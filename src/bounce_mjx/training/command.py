@@ -13,7 +13,7 @@ from bounce_mjx.config.files import flat
 from bounce_mjx.config.settings import Count, NonNegativeInt, fields_in
 from bounce_mjx.errors import UserError
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.runs.settings import Choice, ChoiceFlags, Layers, read_layers
+from bounce_mjx.runs.layers import Choice, ChoiceFlags, Layers, read_layers
 
 PROG = "bounce-mjx train"
 ABOUT = "Trains a policy; by default, one that keeps the ball bouncing."

@@ -35,8 +35,8 @@ from bounce_mjx.physics.convergence import solver_warning
 from bounce_mjx.resources import VERSION
 from bounce_mjx.runs import checkpoints, folders
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.runs.files import writable
 from bounce_mjx.runs.progress import PATIENCE, Progress, are_solved
+from bounce_mjx.runs.storage import writable
 from bounce_mjx.training import events, faults, hosts
 from bounce_mjx.training.clock import Clock
 from bounce_mjx.training.evaluators import Evaluators
@@ -124,7 +124,7 @@ def open_job(
     networks = checkpoints.read_start(config, env) if is_warm else None
     # Before, a signal ends the process by its default action.
     stop = stack.enter_context(StopRequest())
-    run = _make_run(config) if resume is None else folders.find_run(resume)
+    run = _make_run(config) if resume is None else folders.run_of(resume)
     job = Job(
         config=config,
         env=env,
@@ -455,7 +455,9 @@ class Job:
             self.say(f"a callback failed after {self.steps:,} steps; {self.go_on}")
             raise self.failure
         if stopping:
-            raise TrainingStopped(f"stopped after {self.steps:,} steps{where}; {self.go_on}")
+            raise TrainingStopped(
+                f"stopped after {self.steps:,} steps{where}; {self.go_on}{self.report_so_far}"
+            )
 
     def evaluate_best(self) -> bool:
         """Evaluates the best policies on fresh resets, and writes the results; returns False if a
@@ -588,6 +590,16 @@ class Job:
         own = [self.config.env.task] if algorithm is None else [self.config.env.task, algorithm]
         flags = [str(self.run), *import_flags(*own)]
         return f"continue with: bounce-mjx train {shlex.join(flags)}"
+
+    @property
+    def report_so_far(self) -> str:
+        """How to draw the report of a training that is stopped; empty before an evaluation."""
+        evaluated = [seed for seed in self.seeds if seed.progress.best is not None]
+        if not evaluated:
+            return ""
+        best = max(evaluated, key=lambda seed: seed.progress.best.score)
+        words = shlex.join([str(best.run), *imports_of(best.config)])
+        return f" (its report so far: bounce-mjx report {words})"
 
     # Signals and faults
 

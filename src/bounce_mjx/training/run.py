@@ -20,13 +20,14 @@ from bounce_mjx.errors import UserError, reason_of, shorten
 from bounce_mjx.evaluation.config import EvaluationOptions
 from bounce_mjx.evaluation.policy_evaluation import evaluate_policy
 from bounce_mjx.evaluation.results import Report
+from bounce_mjx.interrupt import StopRequest, in_daemon_thread
 from bounce_mjx.reports.tables import details_line, results_table, seeds_table, unsolved_line
 from bounce_mjx.resources import POLICIES
 from bounce_mjx.runs import folders
 from bounce_mjx.runs.checkpoints import read_actor
 from bounce_mjx.runs.config import TrainConfig, load_run_config
+from bounce_mjx.runs.layers import FLAGS, PYTHON, Layers, layers_on
 from bounce_mjx.runs.progress import load_results
-from bounce_mjx.runs.settings import FLAGS, PYTHON, Layers, layers_on
 from bounce_mjx.runs.start import find_start
 from bounce_mjx.task.registry import task_name
 from bounce_mjx.task.task import Task
@@ -115,7 +116,7 @@ class Run:
         """Measures the results of the best checkpoint, as `bounce-mjx eval` does.
 
         Args:
-          options: fields of `EvaluationOptions`, such as episodes=64, or commands={"target_height":
+          options: fields of `EvaluationOptions`, such as episodes=64, or goals={"target_height":
             0.5}.
 
         Raises:
@@ -310,16 +311,24 @@ def print_results(seeds: Sequence[job.SeedRun], console: Console) -> job.SeedRun
 
 
 def leave_report(seed: job.SeedRun, console: Console) -> None:
-    """Draws the report. The training is already saved, so a failure only prints one line."""
+    """Draws the report. The training is already saved, so a failure only prints one line.
+
+    Raises:
+      TrainingStopped: a signal came meanwhile.
+    """
     started = time.perf_counter()
+    words = shlex.join([str(seed.run), *job.imports_of(seed.config)])
+    again = f"draw it with: bounce-mjx report {words}"
     try:
         # Imported during the compilation (`Job.compile`).
         from bounce_mjx.reports.page import write_report
 
-        path = write_report(seed.run, seed.progress.best.recording)
+        with StopRequest() as stop:
+            drawing = in_daemon_thread(lambda: write_report(seed.run, seed.progress.best.recording))
+            if not stop.wait_for(drawing):
+                raise job.TrainingStopped(f"report: not drawn, as a signal came; {again}")
+        path = drawing.result()
     except Exception as error:
-        again = shlex.join([str(seed.run), *job.imports_of(seed.config)])
-        reason = reason_of(error)
-        say(console, f"report: not drawn ({reason}); draw it with: bounce-mjx report {again}")
+        say(console, f"report: not drawn ({reason_of(error)}); {again}")
     else:
         say(console, f"report: {path}  ({time.perf_counter() - started:.1f} s)")

@@ -13,8 +13,8 @@ from bounce_mjx.errors import reason_of
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.runs import checkpoints
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.runs.files import to_json, write_atomically
 from bounce_mjx.runs.progress import RESULTS_FILE
+from bounce_mjx.runs.storage import to_json, write_atomically
 from bounce_mjx.training import hosts
 from bounce_mjx.training.seeds import SeedRun
 from bounce_mjx.training.trainer import Snapshot

@@ -143,7 +143,7 @@ class _Plots:
 
     def _levels(self, frame: EnvFrame) -> dict[str, float]:
         """The task's heights."""
-        return self._env.task.levels(at_index(frame.command, 0))
+        return self._env.task.levels(at_index(frame.goal, 0))
 
     def _height_row(self, frame: EnvFrame) -> list[float]:
         """The heights of the balls, of the task's levels and of the paddle."""

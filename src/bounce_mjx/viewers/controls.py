@@ -11,14 +11,14 @@ from bounce_mjx.viewers.film import FilmPlayer, world_rows
 from bounce_mjx.viewers.options import PageStart
 from bounce_mjx.viewers.simulation import Simulation
 from bounce_mjx.viewers.world import WorldSlider
-from bounce_mjx.world.config import Command
+from bounce_mjx.world.config import Goal
 
 # Slowest and fastest speed, as factors of real time.
 _SPEED_RANGE = (0.1, 4.0)
 _PUSH_RANGE = (0.05, 1.0)
 _DIRECTIONS = ("up", "away", "back", "left", "right")
 _SPEED_STEP = 0.1
-# Steps of a command's slider in a change by a key.
+# Steps of a goal's slider in a change by a key.
 _STEPS_PER_KEY = 5
 # Decimals that a page keeps.
 _DECIMALS = 6
@@ -27,7 +27,7 @@ _SAMPLED = "sampled at each reset"
 
 class _Setting:
     """A slider, or a choice by names, for a value that is sampled as long as `sampled` is on: a
-    command has a checkbox of its own, and all terms of the world share one."""
+    goal has a checkbox of its own, and all terms of the world share one."""
 
     def __init__(
         self,
@@ -85,7 +85,7 @@ class _Setting:
 
 
 class Controls:
-    """Pause, speed, number of robots, reset, the task's commands, pushes and the world."""
+    """Pause, speed, number of robots, reset, the task's goals, pushes and the world."""
 
     def __init__(self, gui: viser.GuiApi, simulation: Simulation, start: PageStart):
         self._simulation = simulation
@@ -104,9 +104,9 @@ class Controls:
             "play it again" if self._is_film else "reset the robots", icon=viser.Icon.REFRESH
         )
         reset.on_click(self._reset)
-        self._commands = {
-            name: self._add_command(gui, name, command)
-            for name, command in simulation.env.config.commands.items()
+        self._goals = {
+            name: self._add_goal(gui, name, goal)
+            for name, goal in simulation.env.config.goals.items()
         }
         with gui.add_folder("push the ball", visible=not self._is_film):
             self._push_speed = gui.add_slider("speed, m/s", *_PUSH_RANGE, 0.05, 0.2)
@@ -119,32 +119,32 @@ class Controls:
             gui.add_command(label, hotkey=key).on_trigger(act)
         self.show_values()
 
-    def _add_command(self, gui: viser.GuiApi, name: str, command: Command) -> _Setting:
-        given = self._simulation.command.get(name)
-        start = 0.5 * (command.low + command.high) if given is None else given
+    def _add_goal(self, gui: viser.GuiApi, name: str, goal: Goal) -> _Setting:
+        given = self._simulation.goal.get(name)
+        start = 0.5 * (goal.low + goal.high) if given is None else given
         start = round(float(start), _DECIMALS)
         # A value that is given beyond what is offered widens the slider.
-        reached = [start, *command.offered]
+        reached = [start, *goal.offered]
         lowest = round(float(min(reached)), _DECIMALS)
         highest = round(float(max(reached)), _DECIMALS)
         label = words(name)
         # The folder has the whole name, as the panel is narrow.
-        short = label.split()[-1] + (f", {command.unit}" if command.unit else "")
+        short = label.split()[-1] + (f", {goal.unit}" if goal.unit else "")
         with gui.add_folder(label):
             sampled = gui.add_checkbox(_SAMPLED, given is None, visible=not self._is_film)
-            if command.names:
-                handle = gui.add_dropdown(short, command.names, disabled=self._is_film)
+            if goal.names:
+                handle = gui.add_dropdown(short, goal.names, disabled=self._is_film)
             else:
                 handle = gui.add_slider(
                     short,
                     lowest,
                     highest,
-                    command.step / _STEPS_PER_KEY,
+                    goal.step / _STEPS_PER_KEY,
                     start,
                     disabled=self._is_film,
                 )
-        setting = _Setting(handle, sampled, command.names)
-        if command.names:
+        setting = _Setting(handle, sampled, goal.names)
+        if goal.names:
             setting.show(start)
         return setting
 
@@ -173,9 +173,9 @@ class Controls:
 
     def show_values(self) -> None:
         """Shows the sampled values that hold in the first environment."""
-        for name, setting in self._commands.items():
+        for name, setting in self._goals.items():
             if setting.sampled.value:
-                setting.show(float(self._simulation.frame.command[name][0]))
+                setting.show(float(self._simulation.frame.goal[name][0]))
         for slider, setting in self._world.items():
             if setting.sampled.value:
                 setting.show(self._simulation.world_value(slider.term) / slider.scale)
@@ -199,8 +199,8 @@ class Controls:
         ]
         if self._is_film:
             return keys
-        if self._commands:
-            name = words(next(iter(self._commands)))
+        if self._goals:
+            name = words(next(iter(self._goals)))
             keys += [
                 (f"{name} up", "T", lambda _: self._move(1.0)),
                 (f"{name} down", "G", lambda _: self._move(-1.0)),
@@ -220,9 +220,9 @@ class Controls:
         self._requests.put(self._simulation.reset)
 
     def _move(self, steps: float) -> None:
-        """Moves the first command by a number of its steps."""
-        name, setting = next(iter(self._commands.items()))
-        setting.move(steps * self._simulation.env.config.commands[name].step)
+        """Moves the first goal by a number of its steps."""
+        name, setting = next(iter(self._goals.items()))
+        setting.move(steps * self._simulation.env.config.goals[name].step)
 
     def _accelerate(self, change: float) -> None:
         speed = round(_clip(self._speed) + change, 1)
@@ -246,9 +246,9 @@ class Controls:
             while not self._requests.empty():
                 self._requests.get()()
             return
-        self._simulation.command = {
+        self._simulation.goal = {
             name: setting.value
-            for name, setting in self._commands.items()
+            for name, setting in self._goals.items()
             if not setting.sampled.value
         }
         if self._world:

@@ -52,20 +52,20 @@ class Display:
 
     def __init__(self, env: Env):
         self._task = env.task
-        lowest = {name: command.low for name, command in env.config.commands.items()}
+        lowest = {name: goal.low for name, goal in env.config.goals.items()}
         self.model = _with_markers(env.config, env.task.markers(lowest, NO_METRICS))
         self.data = mujoco.MjData(self.model)
 
     def pose(
         self,
         qpos: np.ndarray,
-        command: dict[str, float],
+        goal: dict[str, float],
         metrics: Mapping[str, float] = NO_METRICS,
     ) -> None:
         """Moves `data` to generalised positions [nq], and the markers to their places for the
-        commands and the last step's metrics; their sizes and colours stay."""
+        goals and the last step's metrics; their sizes and colours stay."""
         self.data.qpos[:] = qpos
-        for marker in self._task.markers(command, metrics):
+        for marker in self._task.markers(goal, metrics):
             body = self.model.body(marker_body(marker.name))
             self.data.mocap_pos[body.mocapid] = marker.position
         mujoco.mj_kinematics(self.model, self.data)

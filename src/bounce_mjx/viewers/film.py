@@ -24,7 +24,7 @@ class FilmPlayer(Simulation):
         """Compiles nothing."""
         self.env = film.env
         self.policy = None
-        self.command = {}
+        self.goal = {}
         # The controls then show the values that hold.
         self.world = None
         self.others = ()
@@ -122,7 +122,7 @@ def episode_frames(
         qpos=qpos,
         balls=np.stack([qpos[..., list(ball.qpos[:3])] for ball in env.addresses.balls], axis=2),
         paddle=np.moveaxis(recorded.paddle, -1, 1),
-        command=recorded.command,
+        goal=recorded.goal,
         metrics=recorded.metrics,
         over=over,
         lost=recorded.terminated,

@@ -134,7 +134,7 @@ class Renderer(contextlib.AbstractContextManager):
     def render(
         self,
         qpos: np.ndarray,
-        command: dict[str, float],
+        goal: dict[str, float],
         metrics: Mapping[str, float] = NO_METRICS,
         trail: np.ndarray | None = None,
     ) -> np.ndarray:
@@ -142,14 +142,14 @@ class Renderer(contextlib.AbstractContextManager):
 
         Args:
           qpos: generalised positions [nq].
-          command: the commands, which place the markers, as do the last step's metrics.
+          goal: the goals, which place the markers, as do the last step's metrics.
           trail: positions of each ball [P, B, 3] to connect by a line, oldest first, m.
 
         Raises:
           UserError: no OpenGL library works.
         """
         renderer = self._renderer()
-        self._display.pose(qpos, command, metrics)
+        self._display.pose(qpos, goal, metrics)
         renderer.update_scene(self._display.data, self._camera)
         if trail is not None:
             draw_trail(renderer.scene, trail)

@@ -135,14 +135,14 @@ class Scene:
         frame = frames[-1]
         with self._server.atomic():
             for i, label in enumerate(self._labels):
-                qpos, command, metrics = environment_pose(frame, i)
-                display.pose(qpos, command, metrics)
+                qpos, goal, metrics = environment_pose(frame, i)
+                display.pose(qpos, goal, metrics)
                 positions[i] = display.data.xpos
                 rotations[i] = display.data.xquat
                 # An empty label would be a white stroke.
                 label.text = self._label(frame, i)
                 label.visible = bool(label.text)
-                top = max(self._env.task.levels(command).values(), default=0.0)
+                top = max(self._env.task.levels(goal).values(), default=0.0)
                 height = max(_LABEL_HEIGHT, top + _LABEL_DISTANCE)
                 label.position = self._label_places[i] + (0.0, 0.0, height)
             for body, handle in self._bodies.items():

@@ -12,7 +12,7 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.interrupt import StopRequest
 from bounce_mjx.learning.policy import Policy
 from bounce_mjx.robot.model import fingerprint
-from bounce_mjx.runs.files import check_output, write_output
+from bounce_mjx.runs.storage import check_output, write_output
 from bounce_mjx.viewers.film import FilmPlayer
 from bounce_mjx.viewers.native import has_display, show_window
 from bounce_mjx.viewers.options import MAX_ENVS, Address, PageStart, ViewerOptions
@@ -38,7 +38,7 @@ def show(
     shown: Sequence[Shown],
     options: ViewerOptions,
     *,
-    commands: dict[str, float],
+    goals: dict[str, float],
     console: Console,
 ) -> None:
     """Shows or records environments under their controllers; Ctrl-C closes a viewer.
@@ -46,7 +46,7 @@ def show(
     Args:
       shown: one, or several with the same task and robot side by side, on the page or in its
         recording. The labels of several are A, B, ...
-      commands: values of the task's commands; the others are sampled.
+      goals: values of the task's goals; the others are sampled.
 
     Raises:
       UserError: a file cannot be written, or the viewer does not work here, or it shows only one
@@ -61,7 +61,7 @@ def show(
         with console.status("compiling"):
             if shown[0].film is not None:
                 return shown[0].film()
-            return _simulate(shown, each, options.seed, commands, viewer == "browser")
+            return _simulate(shown, each, options.seed, goals, viewer == "browser")
 
     start = PageStart(shown[0].title, None, each)
     if len(shown) > 1:
@@ -153,7 +153,7 @@ def _robot(config: WorldConfig) -> bytes:
 
 
 def _simulate(
-    shown: Sequence[Shown], each: int, seed: int, commands: dict[str, float], has_sliders: bool
+    shown: Sequence[Shown], each: int, seed: int, goals: dict[str, float], has_sliders: bool
 ) -> Simulation:
     """Compiles the simulation.
 
@@ -178,7 +178,7 @@ def _simulate(
         ranges = reset_ranges(one.config) if has_sliders else None
         controller = one.make_controller(env)
         simulation = Simulation(env, controller, num_envs, seed, ranges, one.policy)
-        simulation.command = commands
+        simulation.goal = goals
         simulation.world = world
         simulations.append(simulation)
     first, *others = simulations

@@ -53,8 +53,8 @@ class EnvFrame(NamedTuple):
     """Centre of each ball [N, B, 3], m."""
     paddle: np.ndarray
     """The paddle's centre [N, 3], m."""
-    command: dict[str, np.ndarray]
-    """Commands [N]."""
+    goal: dict[str, np.ndarray]
+    """Goals [N]."""
     metrics: dict[str, np.ndarray]
     """Metrics of the step [N], among them the weighted reward terms `reward/<term>`."""
     over: np.ndarray
@@ -66,21 +66,21 @@ class EnvFrame(NamedTuple):
 
 
 def at_index(values: dict[str, np.ndarray], index: int) -> dict[str, float]:
-    """Commands or metrics [N] of one environment, each a number."""
+    """Goals or metrics [N] of one environment, each a number."""
     return {name: float(value[index]) for name, value in values.items()}
 
 
 def environment_pose(
     frame: EnvFrame, index: int
 ) -> tuple[np.ndarray, dict[str, float], dict[str, float]]:
-    """The positions [nq], the commands and the metrics of one environment of a frame."""
-    command, metrics = (at_index(x, index) for x in (frame.command, frame.metrics))
-    return frame.qpos[index], command, metrics
+    """The positions [nq], the goals and the metrics of one environment of a frame."""
+    goal, metrics = (at_index(x, index) for x in (frame.goal, frame.metrics))
+    return frame.qpos[index], goal, metrics
 
 
 def frame_readings(env: Env, frame: EnvFrame, index: int = 0) -> dict[str, str]:
     """The task's readings of one environment of a frame."""
-    return env.task.readings(at_index(frame.command, index), at_index(frame.metrics, index))
+    return env.task.readings(at_index(frame.goal, index), at_index(frame.metrics, index))
 
 
 def frame_at(recording: EnvFrame, i: int) -> EnvFrame:
@@ -112,14 +112,14 @@ class Simulation:
         self.env = env
         self.policy = policy
         """The policy that acts; another one of the same shapes may replace it between two steps."""
-        self.command: dict[str, float] = {}
-        """Commands of all environments that are set; the others are sampled."""
+        self.goal: dict[str, float] = {}
+        """Goals of all environments that are set; the others are sampled."""
         self.world: dict[str, Sequence[float]] | None = None
         """Entries of terms of the world that are set in all environments; those that are not named
         are nominal. None for a world sampled at each reset. `world_value` tells what holds."""
         self.others: Sequence[Simulation] = ()
         """Simulations of the same robot that are shown with this one, after its environments, and
-        have its commands and its world."""
+        have its goals and its world."""
         self._controller = controller
         self._ranges = ranges
         self._key = jax.random.PRNGKey(seed)
@@ -143,12 +143,12 @@ class Simulation:
 
     @property
     def frame(self) -> EnvFrame:
-        """The current frame, which already shows the commands that the next step sets."""
+        """The current frame, which already shows the goals that the next step sets."""
         frame = self._frame
         if self.others:
             frame = _side_by_side([frame, *(other.frame for other in self.others)])
-        given = {name: np.full_like(frame.command[name], x) for name, x in self.command.items()}
-        return frame._replace(command=frame.command | given)
+        given = {name: np.full_like(frame.goal[name], x) for name, x in self.goal.items()}
+        return frame._replace(goal=frame.goal | given)
 
     @property
     def sliders(self) -> tuple[WorldSlider, ...]:
@@ -173,7 +173,7 @@ class Simulation:
     def step(self) -> EnvFrame:
         """Advances one control step."""
         for other in self.others:
-            other.command = self.command
+            other.goal = self.goal
             other.world = self.world
             other.push(self._push)
             other.step()
@@ -196,7 +196,7 @@ class Simulation:
     def _inputs(self) -> tuple:
         """Arguments of the program of a step."""
         config = self.env.config
-        command = {name: np.float32(self.command.get(name, np.nan)) for name in config.commands}
+        goal = {name: np.float32(self.goal.get(name, np.nan)) for name in config.goals}
         world = {}
         for name in config.randomization.terms:
             # A term without a nominal value stays sampled.
@@ -205,7 +205,7 @@ class Simulation:
                 entries = self._entries(name)
                 # A number has the shape (), and its entries may be a tuple of one.
                 world[name] = np.full(shape or 1, entries, np.float32).reshape(shape)
-        return self.policy, self._key, self._states, self._steps, command, self._push, world
+        return self.policy, self._key, self._states, self._steps, goal, self._push, world
 
     def _entries(self, term: str) -> np.ndarray | Sequence[float] | float:
         """Entries of a term of the world that are set; nan where it is sampled."""
@@ -230,9 +230,9 @@ class Simulation:
         steps = jnp.where(over, 0, steps)
         return states, steps, _view(self.env, states, steps, jnp.zeros_like(over))
 
-    def _advance(self, policy, key, states, steps, command, push, world):
+    def _advance(self, policy, key, states, steps, goal, push, world):
         key, action_key = jax.random.split(key)
-        states = _change(self.env, states, command, push, world)
+        states = _change(self.env, states, goal, push, world)
         actions = self._controller(policy, states, action_key)
         after = jax.vmap(self.env.step, in_axes=-1, out_axes=-1)(states, actions)
         steps = steps + 1
@@ -307,11 +307,11 @@ def resample(recording: EnvFrame, dt: float, fps: float) -> EnvFrame:
     return frames._replace(**blended, over=happened(recording.over), lost=happened(recording.lost))
 
 
-def _change(env: Env, states: State, command: World, push: jax.Array, world: World) -> State:
+def _change(env: Env, states: State, goal: World, push: jax.Array, world: World) -> State:
     """States [..., N] with what a user changes.
 
     Args:
-      command: commands; nan keeps one.
+      goal: goals; nan keeps one.
       push: velocity that is added to the ball's [3], m/s.
       world: terms of the world that have a nominal value; nan keeps an entry.
     """
@@ -321,7 +321,7 @@ def _change(env: Env, states: State, command: World, push: jax.Array, world: Wor
         qvel = qvel.at[jnp.array(ball.qvel[:3])].add(push[:, None])
     changed = before._replace(
         physics=before.physics._replace(qvel=qvel),
-        command=_replace_given(command, before.command),
+        goal=_replace_given(goal, before.goal),
     )
 
     def with_world(state: EnvState) -> EnvState:
@@ -350,7 +350,7 @@ def _view(env: Env, states: State, steps: jax.Array, over: jax.Array) -> EnvFram
         qpos=now.physics.qpos.T,
         balls=jnp.moveaxis(now.physics.qpos[jnp.array(places)], -1, 0),
         paddle=kinematics.paddle_position.T,
-        command=now.command,
+        goal=now.goal,
         metrics=states.metrics,
         over=over,
         lost=over & (states.done > 0),

@@ -12,7 +12,7 @@ from PIL import Image, ImageDraw, ImageFont
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import MissingPackage, UserError, install_command
 from bounce_mjx.interrupt import Interrupted, StopRequest
-from bounce_mjx.runs.files import new_file, writable
+from bounce_mjx.runs.storage import new_file, writable
 from bounce_mjx.viewers.display import Trail
 from bounce_mjx.viewers.offscreen import Renderer, choose_opengl
 from bounce_mjx.viewers.simulation import (

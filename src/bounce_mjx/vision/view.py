@@ -40,7 +40,7 @@ def report_height(cameras: Sequence[Camera], size: tuple[int, int], metadata: Me
     home = paddle_position(metadata, np.array(metadata.default_joint_angles))
     highest = highest_seen(cameras, size, home)
     text = f"all cameras see the ball up to a height of {highest:.2f} m"
-    target = metadata.commands.get("target_height")
+    target = metadata.goals.get("target_height")
     if target is None:
         return text
     apex = target.range[1]

@@ -5,15 +5,15 @@ import math
 import numbers
 import os
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import pydantic
 from pydantic import Field
 
 from bounce_mjx.config import settings
-from bounce_mjx.config.places import where_made
+from bounce_mjx.config.places import where_made, where_raised
 from bounce_mjx.config.settings import is_finite
-from bounce_mjx.errors import UserError, shorten
+from bounce_mjx.errors import UserError, reason_of, shorten
 from bounce_mjx.robot.config import NEED_SITE, RobotConfig, Vector, is_packaged
 from bounce_mjx.world.limits import Limits
 from bounce_mjx.world.observation import ObservationConfig, ObservationLayout
@@ -29,9 +29,9 @@ NumBalls = Annotated[int, pydantic.BeforeValidator(settings.whole_number), Field
 
 
 @dataclasses.dataclass(frozen=True)
-class Command:
+class Goal:
     """A number that the policy has to follow: sampled at a reset and after each interval
-    (`randomization.command_interval`), or set by a user.
+    (`randomization.goal_interval`), or set by a user.
 
     Raises:
       UserError: nothing can be sampled from its range, or its limits exclude a part of it.
@@ -56,8 +56,8 @@ class Command:
     """Names of the values 0 to 1, 1 to 2, ..., if they are choices; a user may give a name. None is
     a number, which would be taken for a value."""
     hidden: bool = False
-    """Whether the policy need not see it, because it acts through other commands."""
-    setting: str = "a command"
+    """Whether the policy need not see it, because it acts through other goals."""
+    setting: str = "a goal"
     """The setting that gives its range, for an error."""
     reason: str = ""
     """Why its limits are what they are, for an error, such as "as max_distance is 0.7 m"."""
@@ -67,27 +67,27 @@ class Command:
         is_range = is_finite(self.low) and is_finite(self.high) and self.low <= self.high
         if not is_range:
             raise UserError(
-                f"a command{place} is sampled from {_words(self.low)} to {_words(self.high)}; give "
+                f"a goal{place} is sampled from {_words(self.low)} to {_words(self.high)}; give "
                 "two finite numbers, the lower one first"
             )
         if not self.least <= self.low <= self.high <= self.greatest:
             raise UserError(
-                f"{self.setting}{place}: a command is sampled from {self.low:.4g} to "
+                f"{self.setting}{place}: a goal is sampled from {self.low:.4g} to "
                 f"{self.high:.4g}, but must be {self._limits}"
             )
         if self.span is not None and not self._is_span():
             raise UserError(
-                f"a command{place} is offered as {shorten(repr(self.span))}; give two finite "
+                f"a goal{place} is offered as {shorten(repr(self.span))}; give two finite "
                 "numbers, the lower one first"
             )
         if not (is_finite(self.step) and self.step > 0.0):
             raise UserError(
-                f"a command{place} has the step {shorten(repr(self.step))}; give a number above 0"
+                f"a goal{place} has the step {shorten(repr(self.step))}; give a number above 0"
             )
         are_names = isinstance(self.names, tuple) and all(map(_is_name, self.names))
         if not are_names:
             raise UserError(
-                f"a command{place} has the names {shorten(repr(self.names))}; give a tuple of "
+                f"a goal{place} has the names {shorten(repr(self.names))}; give a tuple of "
                 "names, of which none is a number"
             )
 
@@ -322,22 +322,26 @@ class WorldConfig(WorldSettings):
         return self
 
     @pydantic.model_validator(mode="after")
-    def _check_commands(self):
-        """The commands are within their limits, and there are some where they are sampled again."""
+    def _check_goals(self):
+        """The goals are within their limits, and there are some where they are sampled again."""
         try:
-            commands = self.commands
+            goals = self.goals
         except UserError as error:
             raise ValueError(str(error)) from error
-        if self.task is None or commands:
+        except Exception as error:
+            place = where_raised(error)
+            text = f"{type(error).__name__}: {shorten(reason_of(error), 300)}"
+            raise ValueError(f"the goals{place} end in {text}; correct them") from error
+        if self.task is None or goals:
             return self
         for name, value in (
-            ("command_interval", self.randomization.command_interval is not None),
-            ("first_command_range", self.randomization.first_command_range < 1.0),
+            ("goal_interval", self.randomization.goal_interval is not None),
+            ("first_goal_range", self.randomization.first_goal_range < 1.0),
         ):
             if value:
                 raise ValueError(
                     f"randomization.{name} is given, but the task {self.task.__name__} has no "
-                    "commands; leave it out"
+                    "goals; leave it out"
                 )
         return self
 
@@ -380,9 +384,19 @@ class WorldConfig(WorldSettings):
         """The order of the entries of the observation."""
         return self.observation.layout(self.num_joints, self.num_balls)
 
+    def in_world(self, randomization: RandomizationConfig) -> Self:
+        """The same task, observation and actions in another world. How often the task samples its
+        goals is no part of a world: without an interval of its own, the world has that of the
+        task's default."""
+        default = settings.default_of(type(self).model_fields["randomization"])
+        if randomization.goal_interval is None:
+            kept = {"goal_interval": default.goal_interval}
+            randomization = randomization.model_copy(update=kept)
+        return self.model_copy(update={"randomization": randomization})
+
     @property
-    def commands(self) -> dict[str, Command]:
-        """The commands of the policy, by name; a task's config has its own."""
+    def goals(self) -> dict[str, Goal]:
+        """The goals of the policy, by name; a task's config has its own."""
         return {}
 
     @property
@@ -393,7 +407,7 @@ class WorldConfig(WorldSettings):
     @property
     def targets(self) -> tuple[tuple[float, float, float], ...]:
         """Points to which the `limits` are relative at a reset, m; a task whose ball starts at rest
-        has those of its commands' ranges."""
+        has those of its goals' ranges."""
         return ()
 
     @property

@@ -108,7 +108,7 @@ def without_idle_curriculum(randomization: dict[str, Any]) -> dict[str, Any]:
     acting = dict(randomization)
     if not any(TERMS[name].has_nominal for name in terms):
         acting.pop("share", None)
-        if acting.get("first_command_range", 1.0) == 1.0:
+        if acting.get("first_goal_range", 1.0) == 1.0:
             acting.pop("warmup_steps", None)
     # Values of a file, which are validated later.
     if isinstance(acting.get("shares"), dict):

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from bounce_mjx.physics.scalars import sine_cosine
 
-BALL, JOINTS, FRAME_DROP, PUSH, COMMAND = range(5)
+BALL, JOINTS, FRAME_DROP, PUSH, GOAL = range(5)
 """Streams: independent random numbers of one counter, by their use. A new one goes to the end: a
 stream's number decides its random numbers."""
 
@@ -29,7 +29,7 @@ class Clock(NamedTuple):
     """Control steps since the reset [], int32."""
     phases: jax.Array
     """Phases [3] at the reset, as shares of an interval: of the camera, the time until its first
-    picture; of the pushes and of the commands, the time since the last one. The three properties
+    picture; of the pushes and of the goals, the time since the last one. The three properties
     have their names."""
 
     @property
@@ -43,7 +43,7 @@ class Clock(NamedTuple):
         return self.phases[1]
 
     @property
-    def command_phase(self) -> jax.Array:
+    def goal_phase(self) -> jax.Array:
         """Share of an interval [] that had passed at the reset."""
         return self.phases[2]
 
@@ -51,8 +51,8 @@ class Clock(NamedTuple):
 def first_clock(key: jax.Array, dtype: jnp.dtype) -> Clock:
     """The clock at a reset: a sampled counter, step 0 and sampled phases; consumes the key."""
     counter = jax.lax.bitcast_convert_type(jax.random.bits(key, dtype=jnp.uint32), jnp.int32)
-    # A redraw of the commands takes this stream too, from the next counter.
-    phases = uniform(counter, COMMAND, (3,), dtype)
+    # A redraw of the goals takes this stream too, from the next counter.
+    phases = uniform(counter, GOAL, (3,), dtype)
     return Clock(counter, jnp.zeros((), jnp.int32), phases)
 
 

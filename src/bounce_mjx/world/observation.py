@@ -13,7 +13,7 @@ from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.lazy import jax, jnp
 
 History = Annotated[int, Field(ge=0, le=100)]
-Group = Literal["state", "command", "past", "task"]
+Group = Literal["state", "goal", "past", "task"]
 """Places of quantities in the observation, in their order."""
 
 
@@ -22,7 +22,7 @@ class Quantity:
     """The entries of a quantity that an observation may contain: the metadata of its setting.
 
     Raises:
-      UserError: there is no such size or group, or a command has not one number.
+      UserError: there is no such size or group, or a goal has not one number.
     """
 
     size: int | None
@@ -30,7 +30,7 @@ class Quantity:
     unit: str = ""
     """Unit of the entries; empty for a pure number."""
     group: Group = "task"
-    """Place in the observation: state for the present state, command for the commands, past for
+    """Place in the observation: state for the present state, goal for the goals, past for
     what the world remembers, task for the task's own quantities."""
     per_ball: bool = False
     """Whether each ball has its entries, one ball after another."""
@@ -48,10 +48,10 @@ class Quantity:
                 f"{self}{where_made()} has the group {self.group!r}; choose from "
                 f"{', '.join(groups)}"
             )
-        if self.group == "command" and (self.size != 1 or self.per_ball):
+        if self.group == "goal" and (self.size != 1 or self.per_ball):
             raise UserError(
-                f"{self}{where_made()} shows a command, which is one number; give "
-                f'task.Quantity(1, {self.unit!r}, "command")'
+                f"{self}{where_made()} shows a goal, which is one number; give "
+                f'task.Quantity(1, {self.unit!r}, "goal")'
             )
 
     def entries(self, num_joints: int, num_balls: int) -> int:
@@ -140,7 +140,7 @@ class ObservationConfig(StrictModel):
 
     @property
     def is_momentary(self) -> bool:
-        """Whether the true state of one instant and the commands determine the whole
+        """Whether the true state of one instant and the goals determine the whole
         observation."""
         past = any(count > 1 for count in self.counts().values())
         remembered = self.counts("past") or self.counts("task")

@@ -240,8 +240,8 @@ class RandomizationConfig(StrictModel):
     """Horizontal speed that a push adds to the ball, in a random direction, m/s."""
     push_interval: Annotated[Sampled, Term(NUMBER, bounds=(0.05, 600.0))] = None
     """Time between two pushes, s; 2 s if only push_speed is given."""
-    command_interval: Annotated[Sampled, Term(NUMBER, bounds=(0.05, 600.0))] = None
-    """Time between two samples of the task's commands within an episode, s."""
+    goal_interval: Annotated[Sampled, Term(NUMBER, bounds=(0.05, 600.0))] = None
+    """Time between two samples of the task's goals within an episode, s."""
     ball_start: Annotated[Sampled, Term((3,), bounds=(-1.0, 1.0), nominal=0.0)] = None
     """Displacement of each coordinate of the ball at a reset, in addition to `env.reset`, m."""
     joint_start: Annotated[Sampled, Term(EACH_JOINT, bounds=(-3.0, 3.0), nominal=0.0)] = None
@@ -253,8 +253,8 @@ class RandomizationConfig(StrictModel):
     """Probabilities of single terms, by name, in place of `share`."""
     warmup_steps: Annotated[int, pydantic.BeforeValidator(whole_number), Field(ge=0)] = 0
     """Environment steps over which the ranges grow from the nominal values."""
-    first_command_range: UnitInterval = 1.0
-    """Range of the commands at the start of a training, around the middle of their whole range and
+    first_goal_range: UnitInterval = 1.0
+    """Range of the goals at the start of a training, around the middle of their whole range and
     as a share of it; it grows to the whole range over warmup_steps."""
 
     def __hash__(self) -> int:
@@ -267,7 +267,7 @@ class RandomizationConfig(StrictModel):
         for name in sorted(self.shares or {}):
             self._check_share_of(name)
         varies = any(TERMS[name].has_nominal for name in self.terms)
-        if self.warmup_steps and not varies and self.first_command_range == 1.0:
+        if self.warmup_steps and not varies and self.first_goal_range == 1.0:
             raise ValueError(
                 "warmup_steps is given without a term whose range grows; give both, or neither"
             )
@@ -275,8 +275,8 @@ class RandomizationConfig(StrictModel):
             raise ValueError("share is given without a term that it is of; give both, or neither")
         if self.push_interval and not self.push_speed:
             raise ValueError("push_interval is given without push_speed; give both")
-        if self.first_command_range < 1.0 and not self.warmup_steps:
-            raise ValueError("first_command_range is given without warmup_steps; give both")
+        if self.first_goal_range < 1.0 and not self.warmup_steps:
+            raise ValueError("first_goal_range is given without warmup_steps; give both")
         return self
 
     def _check_share_of(self, name: str) -> None:

@@ -74,8 +74,8 @@ class Instant(NamedTuple):
 
     truth: Kinematics
     """True positions and velocities."""
-    command: dict[str, jax.Array]
-    """Value [] of each command."""
+    goal: dict[str, jax.Array]
+    """Value [] of each goal."""
     last_action: jax.Array
     """Clipped action of the control step [n]."""
     setpoint: Setpoint | None
@@ -183,13 +183,13 @@ class Sensors:
         return Sensing(balls, picture, histories | next_of_task, task)
 
     def _measure(self, now: Instant, picture: Picture) -> dict[str, jax.Array]:
-        """The measured value [size] of each quantity of the world and of each command; of each ball
+        """The measured value [size] of each quantity of the world and of each goal; of each ball
         [B, size] if there are several. The ball's quaternion and spin are the present truth, and so
         is the paddle's position unless a term of `_PADDLE_TERMS` acts and somebody sees it."""
         world = now.world
         angles, velocities = measured_joints(world, now.clock.counter, now.truth)
         measured = now.truth._asdict()
-        measured |= {name: value[None] for name, value in now.command.items()}
+        measured |= {name: value[None] for name, value in now.goal.items()}
         measured |= {
             "action": now.last_action,
             "joint_angles": angles,

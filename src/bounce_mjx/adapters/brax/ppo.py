@@ -17,7 +17,7 @@ from brax.training.agents.ppo import networks as ppo_networks
 from bounce_mjx.errors import UserError
 from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.runs.settings import read_preset
+from bounce_mjx.runs.layers import read_preset
 
 BraxPolicy = Callable[[jax.Array, jax.Array], tuple[jax.Array, dict[str, Any]]]
 """(observation [..., N], key) -> (action [..., A], extras)."""

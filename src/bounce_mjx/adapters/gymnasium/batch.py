@@ -15,8 +15,8 @@ from bounce_mjx.deploy.environments import refuse_warmup
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UnexpectedArgument, UserError
 
-Commands = dict[str, float | np.ndarray]
-"""Some of the task's commands, each [] or [B]; NaN samples it."""
+Goals = dict[str, float | np.ndarray]
+"""Some of the task's goals, each [] or [B]; NaN samples it."""
 
 # The process in which a program has run. JAX's threads are lost when this process forks.
 _jax_process: int | None = None
@@ -87,7 +87,7 @@ class Batch:
         """The space of the observations of one environment."""
         return Box(-np.inf, np.inf, (self.env.observation_size,), np.float32)
 
-    def start(self, mask: np.ndarray, seeds: np.ndarray, commands: Commands) -> np.ndarray:
+    def start(self, mask: np.ndarray, seeds: np.ndarray, goals: Goals) -> np.ndarray:
         """Starts new episodes where the mask [B] is true: the observations of all environments
         [B, N], float32.
 
@@ -97,7 +97,7 @@ class Batch:
         _check_process()
         if not mask.all():
             self.check_started()
-        given = dict.fromkeys(self.config.commands, np.nan) | commands
+        given = dict.fromkeys(self.config.goals, np.nan) | goals
         values = {name: np.full(self.num_envs, x, np.float32) for name, x in given.items()}
         self._episodes = self.programs.start(self._episodes, mask, seeds, values)
         return _with_batch_first(np.asarray(self._episodes.observation))
@@ -135,39 +135,39 @@ class Batch:
         )
 
     def pose(self, index: int) -> tuple[np.ndarray, dict[str, float], dict[str, float]]:
-        """The positions [nq], the commands, and the last step's metrics of one environment."""
+        """The positions [nq], the goals, and the last step's metrics of one environment."""
         self.check_started()
         state = self._episodes.state
         metrics = self._episodes.metrics[:, index]
-        commands = {name: float(value[index]) for name, value in state.command.items()}
+        goals = {name: float(value[index]) for name, value in state.goal.items()}
         values = dict(zip(self.programs.metric_names, metrics.tolist(), strict=True))
-        return np.array(state.physics.qpos[:, index]), commands, values
+        return np.array(state.physics.qpos[:, index]), goals, values
 
     def check_started(self) -> None:
         """Raises `ResetNeeded` before the first start."""
         if self._episodes is None:
             raise ResetNeeded("an environment was used before its reset; call reset() first")
 
-    def checked_commands(self, options: dict[str, Any], *others: str) -> Commands:
-        """The commands among the options of a reset.
+    def checked_goals(self, options: dict[str, Any], *others: str) -> Goals:
+        """The goals among the options of a reset.
 
         Args:
           others: names of other options.
 
         Raises:
-          UserError: a command is not a number within its limits, or an option is unknown, which is
+          UserError: a goal is not a number within its limits, or an option is unknown, which is
             a TypeError too.
         """
-        commands = self.config.commands
+        goals = self.config.goals
         for name in options:
-            if name not in (known := (*commands, *others)):
+            if name not in (known := (*goals, *others)):
                 raise UnexpectedArgument(
                     f"reset got an unexpected option {name!r}; known options are: "
                     f"{', '.join(known) or 'none'}"
                 )
         return {
-            name: command.checked(options[name], f"the option {name}")
-            for name, command in commands.items()
+            name: goal.checked(options[name], f"the option {name}")
+            for name, goal in goals.items()
             if options.get(name) is not None
         }
 

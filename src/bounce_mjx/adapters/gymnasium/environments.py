@@ -16,7 +16,7 @@ from gymnasium.vector.utils import batch_space
 
 from bounce_mjx.adapters.gymnasium.batch import (
     Batch,
-    Commands,
+    Goals,
     ResetNeeded,
     StepArrays,
     checked_actions,
@@ -106,15 +106,15 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         """Starts an episode.
 
         Args:
-          options: the task's commands of this episode by name, instead of sampled ones.
+          options: the task's goals of this episode by name, instead of sampled ones.
 
         Returns:
           The first observation [N] and an empty info.
         """
-        commands = self._batch.checked_commands(options or {})
+        goals = self._batch.checked_goals(options or {})
         super().reset(seed=seed)
         seeds = np.array([_next_seed(self.np_random)])
-        observation = self._batch.start(_CHOSEN, seeds, commands)
+        observation = self._batch.start(_CHOSEN, seeds, goals)
         self._has_ended = False
         return observation[0], {}
 
@@ -216,13 +216,13 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
 
         Args:
           seed: s seeds the environments with s, s + 1, ...; a list gives each one's seed.
-          options: the task's commands of these episodes by name; "reset_mask" [B], bool, chooses
+          options: the task's goals of these episodes by name; "reset_mask" [B], bool, chooses
             the environments.
 
         Returns:
           The observations of all environments [B, N] and an empty info.
         """
-        commands = self._batch.checked_commands(options or {}, "reset_mask")
+        goals = self._batch.checked_goals(options or {}, "reset_mask")
         mask = _checked_mask((options or {}).get("reset_mask"), self.num_envs)
         if seed is None or isinstance(seed, int | np.integer):
             seed = [None if seed is None else int(seed) + i for i in range(self.num_envs)]
@@ -230,11 +230,9 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
             raise UserError(
                 f"there are {len(seed)} seeds for {self.num_envs} environments; give as many"
             )
-        return self.restart(seed, mask, commands), {}
+        return self.restart(seed, mask, goals), {}
 
-    def restart(
-        self, seeds: Sequence[int | None], mask: np.ndarray, commands: Commands
-    ) -> np.ndarray:
+    def restart(self, seeds: Sequence[int | None], mask: np.ndarray, goals: Goals) -> np.ndarray:
         """Starts new episodes where the mask [B] is true: the observations of all environments
         [B, N].
 
@@ -243,7 +241,7 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
         """
         chosen_seeds = [seed if chosen else None for seed, chosen in zip(seeds, mask, strict=True)]
         self._seeds.seed(chosen_seeds)
-        observation = self._batch.start(mask, self._seeds.draw(mask), commands)
+        observation = self._batch.start(mask, self._seeds.draw(mask), goals)
         self._seeds.use(mask)
         self._ended[mask] = False
         self._statistics.restart(mask)

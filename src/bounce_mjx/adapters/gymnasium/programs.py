@@ -47,26 +47,26 @@ class Programs:
         episodes: Episodes | None,
         mask: jax.Array,
         seeds: jax.Array,
-        commands: dict[str, jax.Array],
+        goals: dict[str, jax.Array],
     ) -> Episodes:
         """New episodes where the mask [B] is true; `episodes` is None before the first ones.
 
         Args:
           seeds: of the new episodes [B], uint32.
-          commands: each [B]; NaN samples one.
+          goals: each [B]; NaN samples one.
         """
 
-        def first_state(key: jax.Array, commands: dict[str, jax.Array]) -> State:
+        def first_state(key: jax.Array, goals: dict[str, jax.Array]) -> State:
             ranges = self.task.ranges()
-            for name, command in self.task.config.commands.items():
-                given = commands[name]
+            for name, goal in self.task.config.goals.items():
+                given = goals[name]
                 is_free = jnp.isnan(given)
-                low = jnp.where(is_free, command.low, given)
-                high = jnp.where(is_free, command.high, given)
+                low = jnp.where(is_free, goal.low, given)
+                high = jnp.where(is_free, goal.high, given)
                 ranges[name] = low, high
             return self.task.reset(key, ranges)
 
-        states = jax.vmap(first_state, -1, -1)(_keys(seeds), commands)
+        states = jax.vmap(first_state, -1, -1)(_keys(seeds), goals)
         started = self._episodes(states, jnp.zeros(seeds.shape, jnp.int32))
         return started if episodes is None else _choose(mask, started, episodes)
 

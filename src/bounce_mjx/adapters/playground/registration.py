@@ -18,7 +18,7 @@ from bounce_mjx.adapters.playground.environment import (
 )
 from bounce_mjx.resources import TASK_POLICIES
 from bounce_mjx.robot.model import load_model
-from bounce_mjx.runs.settings import read_preset
+from bounce_mjx.runs.layers import read_preset
 from bounce_mjx.task.registry import DEFAULT, task_config
 
 ENVIRONMENTS = {ENV_NAME: DEFAULT} | {f"BounceMjx{task.title()}": task for task in TASK_POLICIES}

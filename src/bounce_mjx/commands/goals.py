@@ -1,4 +1,4 @@
-"""The commands of a task as flags, such as `--target-height 0.5` of the task bounce."""
+"""The goals of a task as flags, such as `--target-height 0.5` of the task bounce."""
 
 from collections.abc import Sequence
 from typing import Annotated, Any, NamedTuple, TypeVar
@@ -13,21 +13,21 @@ from bounce_mjx.config.user_code import own_names
 from bounce_mjx.errors import UserError, warn_once
 from bounce_mjx.task.registry import find_task, registered_tasks
 from bounce_mjx.task.task import Task
-from bounce_mjx.world.config import Command, WorldConfig
+from bounce_mjx.world.config import Goal, WorldConfig
 
 CommandT = TypeVar("CommandT", bound=WhichPolicy)
 
-_GROUP = "commands."
-"""Begin of the dotted keys of a task's commands."""
+_GROUP = "goals."
+"""Begin of the dotted keys of a task's goals."""
 
 
-class GivenCommands(NamedTuple):
-    """The values that a user gave to a task's commands."""
+class GivenGoals(NamedTuple):
+    """The values that a user gave to a task's goals."""
 
     values: dict[str, str]
     """By name, as they stand on the command line."""
     flags: dict[str, str]
-    """The flag of each command by name."""
+    """The flag of each goal by name."""
 
     def checked(self, env: WorldConfig) -> dict[str, float]:
         """The values as numbers.
@@ -38,16 +38,16 @@ class GivenCommands(NamedTuple):
         numbers = {}
         for name, word in self.values.items():
             flag = self.flags[name]
-            if name not in env.commands:
-                raise UserError(f"{flag} is not a command of the run's task; omit it")
-            numbers[name] = env.commands[name].checked(word, flag)
+            if name not in env.goals:
+                raise UserError(f"{flag} is not a goal of the run's task; omit it")
+            numbers[name] = env.goals[name].checked(word, flag)
         return numbers
 
 
-def parse_with_commands(
+def parse_with_goals(
     command_class: type[CommandT], args: Sequence[str], *, prog: str
-) -> tuple[CommandT, GivenCommands]:
-    """Reads a command line in which the commands of the run's task are flags too.
+) -> tuple[CommandT, GivenGoals]:
+    """Reads a command line in which the goals of the run's task are flags too.
 
     Raises:
       UserError: a flag has a bad value, or no task has it.
@@ -65,32 +65,32 @@ def parse_with_commands(
     names = flag_names(fields)
     command = typed(command_class, given, names, prog)
     values = _of_group(given)
-    return command, GivenCommands(values, _of_group(names))
+    return command, GivenGoals(values, _of_group(names))
 
 
 def _fields_of(task: str | None) -> dict[str, FieldInfo]:
-    """The commands of a task, or of every task, as settings by dotted key."""
-    commands: dict[str, Command] = {}
+    """The goals of a task, or of every task, as settings by dotted key."""
+    goals: dict[str, Goal] = {}
     # Without --task, the run may be of any task.
     for name in [task] if task else (*registered_tasks(), *own_names(Task)):
         try:
-            commands |= find_task(name).Config().commands
+            goals |= find_task(name).Config().goals
         except UserError as error:
             if task:
                 raise
             # The run is hardly of a task of another package that is broken.
-            warn_once(f"{error}; its commands are no flags")
+            warn_once(f"{error}; its goals are no flags")
     fields = {}
-    for name, command in commands.items():
-        flag = Flag(metavar="|".join(command.names) or command.unit.upper() or "FLOAT")
+    for name, goal in goals.items():
+        flag = Flag(metavar="|".join(goal.names) or goal.unit.upper() or "FLOAT")
         field = FieldInfo.from_annotation(Annotated[str, flag])
-        field.description = "Command of the task, if the run's task has it."
+        field.description = "Goal of the task, if the run's task has it."
         fields[_GROUP + name] = field
     return fields
 
 
 def _of_group(values: dict[str, Any]) -> dict[str, Any]:
-    """What belongs to a task's commands, by the command's name."""
+    """What belongs to a task's goals, by the goal's name."""
     return {
         key.removeprefix(_GROUP): value for key, value in values.items() if key.startswith(_GROUP)
     }

@@ -359,11 +359,11 @@ class Layers:
         on to that number."""
         if self.start.run is None or "total_steps" not in user.values:
             return []
-        from bounce_mjx.runs.folders import find_run, latest_checkpoint
+        from bounce_mjx.runs.folders import latest_checkpoint, run_of
         from bounce_mjx.runs.progress import Progress, are_solved
         from bounce_mjx.runs.records import verify
 
-        checkpoint = latest_checkpoint(find_run(self.start.run), self.start.run)
+        checkpoint = latest_checkpoint(run_of(self.start.run), self.start.run)
         progress = verify(checkpoint).progress
         seeds = [Progress.model_validate(seed) for seed in progress.get("seeds", [progress])]
         if are_solved(seeds):
