@@ -383,7 +383,7 @@ def choose_checkpoint(
     if run != path:
         results = load_results(_best_seed(run))
         known = results.best.summary if results else "not evaluated"
-        tell(f"using the newest run: {run} ({known})")
+        tell(f"using the newest run: {run}{_arm_of(run)} ({known})")
     return find_checkpoint(run)
 
 
