@@ -53,6 +53,22 @@ _HEIGHTS = (0.3, 0.8)
 _HEIGHT_STEPS = 300
 _BACKLASH = np.deg2rad(0.1)
 _ASYMMETRY = 0.3
+# What a hobby servo measures and holds, rad, and its stiffness and damping beside the model's.
+_RESOLUTION = 2.0 * np.pi / 4096
+_SOFT = 0.3
+_UNDAMPED = 0.5
+# A camera's own clock beside the robot's: its zero, s, and its drift.
+_CLOCK_ZERO = 1000.0
+_CLOCK_DRIFT = 4e-5
+_FLAWS = (
+    "nothing",
+    "backlash",
+    "hobby servos",
+    "own camera clock",
+    "asymmetric friction",
+)
+# Those that the model can be.
+_RIGHT = ("nothing", "own camera clock")
 
 
 class Hidden(NamedTuple):
@@ -60,7 +76,7 @@ class Hidden(NamedTuple):
 
     world: dict[str, np.ndarray]
     flaw: str
-    """What the model lacks: nothing, backlash or friction that differs by direction."""
+    """What is special about it, one of `_FLAWS`."""
 
 
 def hidden_robot(seed: int, flawless: bool = False) -> Hidden:
@@ -84,8 +100,11 @@ def hidden_robot(seed: int, flawless: bool = False) -> Hidden:
     )
     world |= sample_world(servos.ranges(), always, np.dtype("float32"), 6)
     world = {name: np.asarray(value, np.float32) for name, value in world.items()}
-    flaw = ("nothing", "backlash", "nothing", "asymmetric friction")[seed % 4]
-    return Hidden(world, "nothing" if flawless else flaw)
+    flaw = "nothing" if flawless else _FLAWS[seed % len(_FLAWS)]
+    if flaw == "hobby servos":
+        world["servo_gain"] = _SOFT * world["servo_gain"]
+        world["servo_damping"] = _UNDAMPED * world["servo_damping"]
+    return Hidden(world, flaw)
 
 
 def sensor_terms() -> dict[str, float]:
@@ -144,6 +163,8 @@ class _Robot:
 
     def angles(self) -> np.ndarray:
         true = self.data.qpos[self.qpos] + self.bias + self.play
+        if self.flaw == "hobby servos":
+            return _RESOLUTION * np.round(true / _RESOLUTION)
         return true + _ANGLE_NOISE * self.random.standard_normal(6)
 
     def velocities(self) -> np.ndarray:
@@ -165,6 +186,8 @@ class _Robot:
             self.sent.pop(0)
         lag = world.get("servo_lag", 0.0)
         share = 1.0 if lag < 1e-6 else -np.expm1(-dt / lag)
+        if self.flaw == "hobby servos":
+            target = _RESOLUTION * np.round(target / _RESOLUTION)
         self.filtered = self.filtered + share * (target - self.filtered)
         if self.flaw == "backlash":
             torque = d.actuator_force[list(self.addresses.actuators)]
@@ -226,6 +249,8 @@ def record(
                 picture_stamp = arrival + _JITTER * random.standard_normal()
                 # The rows of a log do not go back.
                 last_time = float(np.clip(picture_stamp, last_time, stamp))
+                if hidden.flaw == "own camera clock":
+                    picture_stamp = _CLOCK_ZERO + (1.0 + _CLOCK_DRIFT) * picture_stamp
                 recorder.picture(last_time, ball, picture_stamp)
             if arrived:
                 last_picture = arrived[-1]
@@ -297,22 +322,24 @@ def errors(found: Identified, hidden: Hidden, model: mujoco.MjModel, home) -> di
     return result
 
 
-def covered(found: Identified, hidden: Hidden) -> dict[str, bool]:
-    """Whether the 95% interval of each shown unknown holds the truth."""
+def intervals(found: Identified, hidden: Hidden) -> dict[str, dict[str, float]]:
+    """Of each unknown that the log shows: whether its 95% interval holds the truth, half the width
+    of that, and the error."""
     zero = ("servo_lag", "air_drag", "contact_friction", "joint_frictionloss")
     nominal = dict.fromkeys(zero, 0.0) | hidden.world
     known = {name: nominal[name] for name in found.layout.terms if name in nominal}
     world = found.layout.world(found.layout.vector(known))
     truth = np.concatenate([np.ravel(world[name]) for name in found.layout.terms])
     listed = estimates(found, [f"Joint{i}" for i in range(1, 7)])
-    shown = [(e, x) for e, x in zip(listed, truth, strict=True) if e.seen]
-    return {e.label: bool(e.low <= x <= e.high) for e, x in shown}
-
-
-def widths(found: Identified) -> dict[str, float]:
-    """Half the width of the 95% interval of each term that is one number."""
-    listed = estimates(found, [f"Joint{i}" for i in range(1, 7)])
-    return {e.label: 0.5 * (e.high - e.low) for e in listed if e.label in found.layout.terms}
+    return {
+        entry.label: {
+            "holds": bool(entry.low <= true <= entry.high),
+            "half-width": 0.5 * (entry.high - entry.low),
+            "error": abs(entry.value - float(true)),
+        }
+        for entry, true in zip(listed, truth, strict=True)
+        if entry.seen
+    }
 
 
 def _paddle_normal(model: mujoco.MjModel, world, home) -> np.ndarray:
@@ -354,7 +381,8 @@ def measure(config: WorldConfig, hidden: Hidden, path: Path) -> dict[str, Any]:
     seconds = time.perf_counter() - begin
     processor = time.process_time() - begin_processor
     path.with_suffix(".yaml").write_text(to_yaml(found, log, names, None))
-    inside = covered(found, hidden)
+    shown = intervals(found, hidden)
+    outside = [label for label, entry in shown.items() if not entry["holds"]]
     return {
         "log": path.stem,
         "flaw": hidden.flaw,
@@ -362,10 +390,10 @@ def measure(config: WorldConfig, hidden: Hidden, path: Path) -> dict[str, Any]:
         "processor seconds": processor,
         "errors": errors(found, hidden, model, home),
         "held out": found.held_out,
-        "covered": sum(inside.values()),
-        "shown": len(inside),
-        "outside": [label for label, holds in inside.items() if not holds],
-        "widths": widths(found),
+        "covered": len(shown) - len(outside),
+        "shown": len(shown),
+        "outside": outside,
+        "intervals": shown,
         "dropped": found.dropped,
         "arm": found.choice.chosen.name,
         "leaves at once": found.simulated.leaves_at_once,
@@ -380,10 +408,27 @@ def print_summary(rows: list[dict[str, Any]]) -> None:
     for name in rows[0]["errors"]:
         values = [row["errors"][name] for row in rows]
         print(f"{name:32}{np.median(values):10.4f}{max(values):10.4f}")
-    right = [row for row in rows if row["flaw"] == "nothing"]
-    if right:
-        share = sum(r["covered"] for r in right) / sum(r["shown"] for r in right)
-        print(f"95% intervals that hold the truth, where the model is right: {100 * share:.0f}%")
+    right = [row for row in rows if row["flaw"] in _RIGHT]
+    for kind, some in (("where the model is right", right), ("all robots", rows)):
+        if some:
+            share = sum(r["covered"] for r in some) / sum(r["shown"] for r in some)
+            print(f"95% intervals that hold the truth, {kind}: {100 * share:.0f}%")
+    print_coverage(rows)
+
+
+def print_coverage(rows: list[dict[str, Any]]) -> None:
+    """Of each quantity: how many intervals hold the truth, their median half-width, and the 95%
+    quantile of the errors."""
+    by_quantity: dict[str, list[dict[str, Any]]] = {}
+    for row in rows:
+        for label, shown in row["intervals"].items():
+            by_quantity.setdefault(label.split(" ")[0], []).append(shown)
+    print(f"{'quantity':22}{'hold':>12}{'half-width':>12}{'95% of errors':>15}")
+    for name, shown in by_quantity.items():
+        holds = sum(entry["holds"] for entry in shown)
+        width = np.median([entry["half-width"] for entry in shown])
+        error = np.quantile([entry["error"] for entry in shown], 0.95)
+        print(f"{name:22}{f'{holds} of {len(shown)}':>12}{width:12.4g}{error:15.4g}")
 
 
 def _seeds(text: str) -> list[int]:

@@ -17,7 +17,7 @@ from bounce_mjx.commands.main import main
 from bounce_mjx.deploy.recorder import Recorder
 from bounce_mjx.errors import UserError
 from bounce_mjx.identify.arm import Given, _exact_follower, _late_servos, _own_servos
-from bounce_mjx.identify.ball import check_frame
+from bounce_mjx.identify.ball import check_frame, touch_height
 from bounce_mjx.identify.estimates import estimates, total_delay
 from bounce_mjx.identify.fit import (
     Fit,
@@ -26,8 +26,10 @@ from bounce_mjx.identify.fit import (
     _bounded_step,
     angle_weights,
     correlation_times,
+    differentiate,
     eliminate,
     minimise,
+    minimise_each,
     picture_weights,
 )
 from bounce_mjx.identify.flight import acceleration, fit_flight
@@ -52,7 +54,7 @@ from bounce_mjx.identify.hypotheses import (
     expect_follower,
     judge,
 )
-from bounce_mjx.identify.identification import Identified, identify
+from bounce_mjx.identify.identification import Identified, _correct, _Finer, identify
 from bounce_mjx.identify.inspection import examine
 from bounce_mjx.identify.intervals import Certainty, certainty, resample
 from bounce_mjx.identify.log import Log, find_gaps, join, straighten
@@ -615,6 +617,66 @@ def test_an_error_that_is_no_number_explains_nothing(sensor: str) -> None:
     assert "does not explain the" in describe_doubts(diverged, NAMES)[0]
 
 
+def test_searches_that_are_simulated_together_end_where_each_ends_alone() -> None:
+    """With derivatives of their own, or with ones that were taken elsewhere."""
+    log = flight_log(20.0)
+    problem = linear_problem(log, np.random.default_rng(3))
+    late = np.zeros(len(problem.layout.mean))
+    late[problem.layout.slices["delay"]] = 0.1
+    moved = problem.predict(problem.layout.mean + 0.5 * late, problem.windows.starts)
+    angles = problem.windows.split(moved)[0]
+    problem = problem._replace(windows=problem.windows._replace(angles=angles))
+    weights = problem.weights(pictures=0.0)
+    some = weights * (np.arange(len(weights)) % 3 > 0)[:, None]
+    starts = problem.windows.starts
+    begins = [Fit(problem.layout.mean + share * late, starts) for share in (0.0, 1.0, -2.0)]
+    for used in (weights, some):
+        alone = [minimise(problem, begin, ["arm"], used, 2) for begin in begins]
+        together = minimise_each(problem, begins, ["arm"], used, 2)
+        slopes = differentiate(problem, begins[1], ["arm"], weights)
+        elsewhere = minimise_each(problem, begins, ["arm"], used, 2, None, [slopes] * 3)
+        for one, other, third in zip(alone, together, elsewhere, strict=True):
+            np.testing.assert_array_equal(one.vector, other.vector)
+            assert third.cost == pytest.approx(one.cost, rel=1e-6)
+    counted = []
+
+    def count(vectors: np.ndarray, states: np.ndarray, used: np.ndarray) -> np.ndarray:
+        counted.append(len(vectors))
+        return problem.simulate(vectors, states, used)
+
+    # Derivatives cost many simulations: of a linear problem, they are taken once.
+    minimise(problem._replace(simulate=count), begins[1], ["arm"], weights, 8)
+    assert sum(size > 1 for size in counted) == 1
+
+
+def test_a_search_in_coarse_steps_ends_where_one_in_finer_steps_does() -> None:
+    """What the steps change is taken away, and where it depends on the unknowns, once more."""
+    problem = linear_problem(flight_log(20.0), np.random.default_rng(3))
+    place = problem.layout.slices["delay"].start
+    weights = problem.weights(pictures=0.0)
+    truth = problem.layout.mean.copy()
+    truth[place] += 0.02
+
+    def simulate_finer(vectors: np.ndarray, states: np.ndarray, used: np.ndarray) -> np.ndarray:
+        # 0.005 s later, and by a tenth more sensitive.
+        moved = vectors.copy()
+        moved[:, place] = 1.1 * moved[:, place] + 0.005
+        return problem.simulate(moved, states, used)
+
+    every = np.ones((1, len(weights)), bool)
+    measured = simulate_finer(truth[None], problem.windows.starts[None], every)[0]
+    angles = problem.windows.split(measured)[0]
+    problem = problem._replace(windows=problem.windows._replace(angles=angles))
+    finer = _Finer(simulate_finer, problem.layout)
+    fit = minimise(problem, Fit(problem.layout.mean, problem.windows.starts), ["arm"], weights, 4)
+    errors = [abs(fit.vector[place] - truth[place])]
+    for _ in range(2):
+        corrected = _correct(problem, fit, finer)
+        fit = minimise(corrected, fit, ["arm"], weights, 4)
+        errors.append(abs(fit.vector[place] - truth[place]))
+    assert errors[0] > 5e-3 and errors[1] < 0.2 * errors[0] and errors[2] < 0.2 * errors[1]
+
+
 def test_a_fit_whose_simulation_diverges_has_an_infinite_cost() -> None:
     problem = linear_problem(flight_log(), np.random.default_rng(0))
     start = Fit(problem.layout.mean, problem.windows.starts)
@@ -662,6 +724,33 @@ def test_pictures_of_fewer_than_three_bounces_change_nothing() -> None:
         assert np.sum(windows.has_ball) == count
         assert np.any(windows.picture_weights) == (count > 0)
         assert np.all(windows.starts[~windows.has_ball, 14] == 50.0)
+
+
+@pytest.mark.parametrize("shift", [-0.024, 0.005, 0.024])
+def test_a_height_that_does_not_fit_the_bounces_is_named(shift: float) -> None:
+    """Whichever terms share it, of which none is beyond its prior; 5 mm are a usual camera's."""
+    config, layout = read_preset(Path("default")).env, Layout(6, True, 0.001)
+    windows = windows_of(at_home((0.0, 0.0, shift)))
+    of_camera = {"ball_position_bias": np.array([0.0, 0.0, shift])}
+    # The paddle's offset is in the frame of its body.
+    model = world_model(config, visual=False)
+    addresses, data = find_addresses(model), mujoco.MjData(model)
+    data.qpos[list(addresses.arm_qpos)] = config.default_joint_angles
+    mujoco.mj_kinematics(model, data)
+    frame = data.xmat[model.geom_bodyid[addresses.paddle_geom]].reshape(3, 3)
+    of_paddle = {"paddle_offset": frame.T @ np.array([0.0, 0.0, shift])}
+    heights = []
+    for shared in (of_camera, of_paddle):
+        world = layout.world(layout.vector(shared))
+        heights.append(touch_height(config, windows, world))
+    np.testing.assert_allclose(heights, shift, atol=1e-4)
+    # A joint that is turned by an angle moves the paddle by its lever arm.
+    bias = np.array([0.0, 0.01, 0.0, 0.0, 0.0, 0.0])
+    lever = touch_height(config, windows, layout.world(layout.vector({"encoder_bias": bias})))
+    assert lever == pytest.approx(0.01 * config.ball_init_pos[0], rel=0.05)
+    said = [x for x in sentences(ball_shown()._replace(touch_height=shift), NAMES) if "mm" in x]
+    assert len(said) == (abs(shift) > 0.01)
+    assert all("24 mm " + ("above" if shift > 0.0 else "below") in x for x in said)
 
 
 def test_the_search_sees_a_bounce_of_each_log_that_has_one() -> None:
@@ -906,7 +995,7 @@ def test_an_arm_is_explained_no_worse_than_by_a_delay_and_offsets(
     found = identify(config, log)
     of_delay = np.sqrt(np.mean(found.choice.trial(DELAY).errors ** 2))
     of_model = np.sqrt(np.mean(found.joint_errors**2))
-    assert of_model < 1.15 * of_delay
+    assert of_model < 1.1 * of_delay
     # The delay is that of the targets as they are in the log.
     assert of_delay < 1.2e-4
     assert found.has_set_points == (late < 0.004)

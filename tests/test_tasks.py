@@ -858,23 +858,6 @@ def test_a_command_without_its_import_prints_the_whole_command(
         refused(line, f"import it to run it: bounce-mjx {line} --import {copy}")
 
 
-def test_a_run_of_a_time_when_a_task_was_file_and_class_is_read(mine: Path, tmp_path: Path) -> None:
-    """Its config names the copy of the file, and the record of a checkpoint the original."""
-    import_code(mine)
-    config = read_preset(None, task="dribble").model_copy(update={"log_dir": tmp_path})
-    run_folder = write_policy(config)
-    path = run_folder / CONFIG_FILE
-    path.write_text(path.read_text().replace("task: dribble", "task: task/mine.py:Dribble"))
-    (record,) = run_folder.glob("checkpoints/*/record/metadata")
-    stored = json.loads(record.read_text())
-    stored["config"]["task"] = f"{mine}:Dribble"
-    record.write_text(json.dumps(stored))
-    seal(record.parent.parent)
-    again = load_run_config(run_folder)
-    assert again == config.model_copy(update={"log_dir": again.log_dir})
-    checkpoints.read_policy(find_checkpoint(run_folder), again)
-
-
 def write_policy(config: TrainConfig) -> Path:
     """A run with an untrained policy."""
     shapes = checkpoints.policy_shapes(config)

@@ -13,6 +13,7 @@ from bounce_mjx.identify.fit import (
     correlation_times,
     joint_errors,
     minimise,
+    minimise_each,
     sample,
     seen_windows,
 )
@@ -54,6 +55,8 @@ _FOLLOWING_DELAYS = (5e-4, 1e-3, 3e-3)
 _AS_EXACT = 1.01
 # Steps in which servos of an arm that is carried and of one that is not are fitted and compared.
 _COMPARED = 5
+# Relative change of the units of the residuals that changes no fit.
+_SAME_UNITS = 0.03
 # Candidates with the model's own servos, and with others, from each of which a search over a few
 # windows begins: a servo that is slow and a lag that is long delay alike, and only a search tells
 # them apart.
@@ -141,10 +144,13 @@ def _search_servos(
     seen: each from the better of the best fits of both to a few windows, as a search may have ended
     too early."""
     found = {}
+    begin = None
     for hypothesis in (SERVOS, CARRIED):
         simulated = Simulated(hypothesis.gravity_compensation)
         problem = own._replace(simulate=make(simulated), simulated=simulated)
-        found[hypothesis] = _search_arm(problem, servos, given)
+        # What carries an arm changes offsets, and neither its delay nor its gains.
+        found[hypothesis] = _search_arm(problem, servos, given, begin)
+        begin = found[hypothesis][1]
     noise = own.noise._replace(
         angles=np.min([problem.noise.angles for problem, _ in found.values()], axis=0)
     )
@@ -153,7 +159,7 @@ def _search_servos(
     for hypothesis, (problem, _) in found.items():
         problem = problem._replace(noise=noise, correlation=correlation)
         states = problem.windows.arm_state
-        tried = [minimise(problem, fit, ["arm"], fit.weights, 1, states) for fit in fits]
+        tried = minimise_each(problem, fits, ["arm"], fits[0].weights, 1, states)
         best = min(tried, key=lambda fit: fit.cost)
         # All of them: gravity in postures that a few windows lack would decide otherwise.
         weights = problem.weights(0.0, seen_windows(problem))
@@ -185,8 +191,9 @@ def _exact_follower(
     total = max((given.delay if late else 0.0) + 0.5 * layout.physics_dt, 0.0)
     offsets = given.following.offsets if late else np.zeros(layout.num_joints)
     few = problem.weights(0.0, sample(problem, np.any(windows.angle_weights > 0.0, axis=1)))
-    best: dict[float, tuple[float, Fit]] = {}
-    for gain, longest in itertools.product(_FOLLOWING_GAINS, _FOLLOWING_DELAYS):
+    tried = list(itertools.product(_FOLLOWING_GAINS, _FOLLOWING_DELAYS))
+    begins = []
+    for gain, longest in tried:
         of_servo = max(min(longest, total), _FOLLOWING_DELAYS[0])
         damping = servos.damping_for(of_servo, gain, ARM["servo_damping"].limits)
         world = {
@@ -197,8 +204,14 @@ def _exact_follower(
             "servo_lag": 0.0,
             "joint_frictionloss": np.zeros(layout.num_joints),
         }
-        start = Fit(layout.clip(layout.vector(world)), windows.starts)
-        fit = minimise(problem, start, [], few, 2, windows.arm_state)
+        begins.append(Fit(layout.clip(layout.vector(world)), windows.starts))
+    fits = minimise_each(problem, begins, [], few, 2, windows.arm_state)
+    # A simulated servo is not as late as its stiffness and damping say, to some hundredths of a
+    # millisecond.
+    begins = [_in_time(problem, fit) for fit in fits]
+    fits = minimise_each(problem, begins, [], few, 2, windows.arm_state)
+    best: dict[float, tuple[float, Fit]] = {}
+    for (gain, _), fit in zip(tried, fits, strict=True):
         size = float(np.sum(joint_errors(windows, fit) ** 2)) if np.isfinite(fit.cost) else np.inf
         if size < best.get(gain, (np.inf, fit))[0]:
             best[gain] = size, fit
@@ -209,16 +222,50 @@ def _exact_follower(
     return problem, with_offsets(problem, fit, seen_windows(problem))
 
 
-def _search_arm(problem: Problem, servos: Servos, given: Given) -> tuple[Problem, Fit]:
+def _in_time(problem: Problem, fit: Fit) -> Fit:
+    """The fit with the delay at which its joints are where they were measured: from the error of
+    the angles along their velocity."""
+    windows = problem.windows
+    layout = problem.layout
+    angles, weights = (windows.split(rows)[0] for rows in (fit.predicted, fit.weights))
+    steps = np.diff(windows.angle_times, axis=1)[:, :, None]
+    counts = (weights[:, 1:] > 0.0) & (weights[:, :-1] > 0.0) & (steps > 0.0)
+    velocity = np.where(counts, np.diff(angles, axis=1) / np.where(counts, steps, 1.0), 0.0)
+    early = angles - windows.angles
+    early = np.where(counts, 0.5 * (early[:, 1:] + early[:, :-1]), 0.0)
+    early -= np.sum(early, axis=(0, 1)) / np.maximum(np.sum(counts, axis=(0, 1)), 1)
+    motion = float(np.sum(velocity**2))
+    vector = fit.vector.copy()
+    if np.isfinite(motion) and motion > 0.0:
+        # A simulation that runs ahead is off by its velocity times the time.
+        vector[layout.slices["delay"]] += np.sum(np.where(counts, early * velocity, 0.0)) / motion
+    vector = np.clip(vector, *layout.bounds(vector))
+    return fit._replace(vector=vector, starts=windows.starts)
+
+
+def _search_arm(
+    problem: Problem,
+    servos: Servos,
+    given: Given,
+    other: Fit | None,
+) -> tuple[Problem, Fit]:
     """The best fit to a few windows of the arm, from candidates that differ in what a search could
-    confuse; and the problem in units of the errors that it leaves.
+    confuse, or from the fit of another hypothesis; and the problem in units of the errors that it
+    leaves.
+
+    Args:
+      other: the fit of the other hypothesis, if there is one.
     """
     layout = problem.layout
     windows = problem.windows
     rough = np.hypot(problem.sensors.angles, given.following.errors)
     problem = problem._replace(noise=problem.noise._replace(angles=rough))
-    of_model = _own_servos(layout, servos, given.delay)
-    vectors = np.concatenate([of_model, _late_servos(layout, servos, given.delay)])
+    if other is None:
+        near = _own_servos(layout, servos, given.delay)
+        vectors = np.concatenate([near, _late_servos(layout, servos, given.delay)])
+    else:
+        near = other.vector[None]
+        vectors = near.copy()
     few = problem.weights(0.0, sample(problem, np.any(windows.angle_weights > 0.0, axis=1)))
     used = np.any(few > 0.0, axis=1)
     starts = np.repeat(windows.starts[None], len(vectors), axis=0)
@@ -232,13 +279,11 @@ def _search_arm(problem: Problem, servos: Servos, given: Given) -> tuple[Problem
         vector[layout.slices["servo_offset"]] = offsets
         left = np.where(is_angle, residuals - offsets, 0.0) / rough
         costs.append(np.sum(left**2) if np.all(np.isfinite(left)) else np.inf)
-    is_of_model = np.arange(len(vectors)) < len(of_model)
+    is_near = np.arange(len(vectors)) < len(near)
     ranked = np.argsort(costs)
-    best = [*ranked[is_of_model[ranked]][:_KEPT], *ranked[~is_of_model[ranked]][:_KEPT]]
-    fits = [
-        minimise(problem, Fit(vectors[i], windows.starts), ["arm"], few, 2, windows.arm_state)
-        for i in best
-    ]
+    best = [*ranked[is_near[ranked]][:_KEPT], *ranked[~is_near[ranked]][:_KEPT]]
+    begins = [Fit(vectors[i], windows.starts) for i in best]
+    fits = minimise_each(problem, begins, ["arm"], few, 2, windows.arm_state)
     fit = min(fits, key=lambda fit: fit.cost)
     return in_units_of_errors(problem, fit), fit
 
@@ -275,15 +320,17 @@ def _late_servos(layout: Layout, servos: Servos, delay: float) -> np.ndarray:
 
 
 def _fit_arm(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
-    """The arm in all windows that the search sees, with robust weights: first in units of the
-    errors in a few windows, then in units of what the model leaves in all."""
+    """The arm in all windows that the search sees, to which it was fitted, with robust weights and
+    in units of what the model leaves there."""
     states = problem.windows.arm_state
     seen = seen_windows(problem)
-    fit = minimise(problem, fit, ["arm"], problem.weights(0.0, seen), 8, states)
     for _ in range(2):
+        before = problem.deviations
         problem = in_units_of_errors(problem, fit)
         angles = angle_weights(problem, problem.predict(fit.vector, fit.starts))
         fit = minimise(problem, fit, ["arm"], problem.weights(0.0, seen, angles), 4, states)
+        if np.allclose(problem.deviations, before, rtol=_SAME_UNITS):
+            break
     return problem, fit
 
 

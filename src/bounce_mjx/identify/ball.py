@@ -1,7 +1,6 @@
 """The ball of a robot's world: its flights, then its bounces."""
 
-import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import mujoco
 import numpy as np
@@ -13,8 +12,10 @@ from bounce_mjx.identify.fit import (
     Fit,
     Noise,
     Problem,
+    differentiate,
     flight_errors,
     minimise,
+    minimise_each,
     picture_weights,
     sample,
     seen_windows,
@@ -23,9 +24,11 @@ from bounce_mjx.identify.flight import Flight, acceleration, fit_flight
 from bounce_mjx.identify.following import error_size
 from bounce_mjx.identify.simulation import Simulate, Simulated
 from bounce_mjx.identify.windows import BEFORE_BOUNCE, GUESSED_DRAG, Windows, is_seen
+from bounce_mjx.physics import edited_model
 from bounce_mjx.robot.model import find_addresses
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.model import world_model
+from bounce_mjx.world.sampling import physics_parameters
 
 # Latencies of the ball, s, and its frictions, of the first candidates.
 _LATENCIES = np.arange(-0.004, 0.05, 0.008)
@@ -44,29 +47,59 @@ def check_frame(windows: Windows, config: WorldConfig, source: str) -> None:
       UserError: it does.
     """
     model = world_model(config, visual=False)
+    half_size = model.geom_size[find_addresses(model).paddle_geom]
+    tops = touching(model, windows)
     offsets = []
-    addresses = find_addresses(model)
-    data = mujoco.MjData(model)
-    paddle = addresses.paddle_geom
-    radius = model.geom_size[addresses.balls[0].geom, 0]
-    for s in np.flatnonzero(windows.has_ball & np.any(windows.angle_weights > 0.0, axis=1)):
-        bounce = windows.bounces[s]
-        since = np.abs(windows.angle_times[s] - bounce)
-        near = np.argmin(np.where(windows.angle_weights[s] > 0.0, since, np.inf))
-        data.qpos[list(addresses.arm_qpos)] = windows.angles[s, near]
-        mujoco.mj_kinematics(model, data)
-        normal = data.geom_xmat[paddle].reshape(3, 3)[:, 2]
-        top = data.geom_xpos[paddle] + (model.geom_size[paddle, 2] + radius) * normal
-        ball = windows.balls[s, np.argmin(np.abs(windows.picture_times[s] - bounce))]
-        offsets.append(ball - top)
+    for s, top in tops.items():
+        since = np.abs(windows.picture_times[s] - windows.bounces[s])
+        offsets.append(windows.balls[s, np.argmin(since)] - top)
     offset = np.median(offsets, axis=0) if offsets else np.zeros(3)
-    if np.hypot(*offset[:2]) > np.max(model.geom_size[paddle, :2]) or abs(offset[2]) > _BESIDE:
+    if np.hypot(*offset[:2]) > np.max(half_size[:2]) or abs(offset[2]) > _BESIDE:
         x, y, z = offset
         raise UserError(
             f"the ball in {source} bounces {x:.3f}, {y:.3f}, {z:.3f} m (x, y, z) beside the "
             "paddle; give its position in the frame of the robot's base, in metres, z up, and the "
             "robot with the paddle as it is mounted"
         )
+
+
+def touching(
+    model: mujoco.MjModel, windows: Windows, encoder_bias: np.ndarray | float = 0.0
+) -> dict[int, np.ndarray]:
+    """Where the ball's centre is when it lies on the middle of the paddle [3], m, at the stamp of
+    each window's bounce.
+
+    Args:
+      encoder_bias: measured less true angles [n], rad.
+    """
+    addresses = find_addresses(model)
+    data = mujoco.MjData(model)
+    paddle = addresses.paddle_geom
+    above = model.geom_size[paddle, 2] + model.geom_size[addresses.balls[0].geom, 0]
+    places = {}
+    for s in np.flatnonzero(windows.has_ball & np.any(windows.angle_weights > 0.0, axis=1)):
+        since = np.abs(windows.angle_times[s] - windows.bounces[s])
+        near = np.argmin(np.where(windows.angle_weights[s] > 0.0, since, np.inf))
+        data.qpos[list(addresses.arm_qpos)] = windows.angles[s, near] - encoder_bias
+        mujoco.mj_kinematics(model, data)
+        normal = data.geom_xmat[paddle].reshape(3, 3)[:, 2]
+        places[int(s)] = data.geom_xpos[paddle] + above * normal
+    return places
+
+
+def touch_height(config: WorldConfig, windows: Windows, world: Mapping[str, np.ndarray]) -> float:
+    """By how much higher than on the model's paddle the measured ball touches it, m, in a world:
+    what the height of the ball's frame, the paddle's and the encoders' zeros make together, which
+    bounces show however they are shared. 0 without a bounce."""
+    plain = world_model(config, visual=False)
+    of_paddle = {x: np.asarray(world[x], np.float32) for x in ("paddle_offset", "paddle_tilt")}
+    model = edited_model(plain, physics_parameters(of_paddle, plain))
+    before = touching(plain, windows)
+    after = touching(model, windows, world["encoder_bias"])
+    if not before:
+        return 0.0
+    higher = np.median([after[s][2] - before[s][2] for s in before])
+    return float(higher + world["ball_position_bias"][2])
 
 
 def fit_ball(
@@ -99,18 +132,26 @@ def fit_ball(
     problem.progress("bounce")
     stages = ["flight", "bounce"]
     few = problem.weights(1.0, sample(problem, windows.has_ball))
+    flights = fit
     # A ball that slips and one that sticks are two valleys, and each latency may be one.
-    tried = [
-        _shift_flights(problem, fit, latency, friction)
-        for latency, friction in itertools.product(_LATENCIES, _FRICTIONS)
-    ]
-    for kept, iterations in ((4, 1), (1, 2)):
-        found = [minimise(problem, x, stages, few, iterations, states) for x in tried]
+    tried = []
+    slopes = []
+    for friction in _FRICTIONS:
+        begins = [_shift_flights(problem, fit, latency, friction) for latency in _LATENCIES]
+        tried += begins
+        # Bounces at the same places have nearly the same derivatives.
+        middle = begins[len(begins) // 2]
+        slopes += [differentiate(problem, middle, stages, few, states)] * len(begins)
+    for kept, iterations in ((2, 1), (1, 2)):
+        found = minimise_each(problem, tried, stages, few, iterations, states, slopes)
         tried = sorted(found, key=lambda fit: fit.cost)[:kept]
-    fit = tried[0]
+        slopes = []
+    fit = _shift_others(problem, tried[0], flights, few)
     if not problem.simulated.leaves_at_once:
         problem, fit = _choose_contact(problem, fit, make, few)
-    fit = minimise(problem, fit, stages, problem.weights(1.0, seen), 5, states)
+    of_seen = problem.weights(1.0, seen)
+    fit = minimise(problem, fit, stages, of_seen, 5, states)
+    fit = _shift_others(problem, fit, flights, of_seen)
     fit = minimise(problem, fit, [], problem.weights(1.0, 1.0 - seen), 3, states)
     pictures = picture_weights(problem, problem.predict(fit.vector, fit.starts))
     fit = minimise(problem, fit, stages, problem.weights(pictures, seen), 6, states)
@@ -184,6 +225,18 @@ def _flies(problem: Problem, fit: Fit, flying: np.ndarray) -> bool:
     pictures = problem.windows.picture_weights * flying
     errors = flight_errors(problem, problem.predict(fit.vector, fit.starts), pictures)
     return bool(np.mean(errors[counts] < NO_FLIGHT) > 0.5)
+
+
+def _shift_others(problem: Problem, fit: Fit, flights: Fit, some: np.ndarray) -> Fit:
+    """The fit to some windows (their weights [S, M]), in which the flights of all others explain
+    their pictures before the bounce with its latency too."""
+    places = problem.layout.slices
+    latency, friction = (
+        float(fit.vector[places[x]][0]) for x in ("ball_latency", "contact_friction")
+    )
+    shifted = _shift_flights(problem, flights, latency, friction)
+    fitted = np.any(some > 0.0, axis=1)[:, None]
+    return fit._replace(starts=np.where(fitted, fit.starts, shifted.starts))
 
 
 def _shift_flights(problem: Problem, fit: Fit, latency: float, friction: float) -> Fit:

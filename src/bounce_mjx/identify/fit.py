@@ -5,8 +5,8 @@ matters in one window, are eliminated inside every step: the variable projection
 Pereyra (1973) in the linearised problem.
 """
 
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Generator, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import lsq_linear
@@ -33,6 +33,10 @@ _FARTHEST_START = 5.0
 # Decrease of the cost, and its share, at which a search ends.
 _CONVERGED = 0.3
 _CONVERGED_SHARE = 2e-5
+# Share of the expected decrease from which a step is as the linear problem says, and for how many
+# steps derivatives then serve.
+_AS_EXPECTED = 0.7
+_REUSES = 4
 # Residuals beyond this many standard deviations lose weight (Huber 1964).
 _HUBER = 3.0
 NO_FLIGHT = 25.0
@@ -183,76 +187,234 @@ def minimise(
     weights: np.ndarray,
     iterations: int,
     free_states: np.ndarray | None = None,
+    slopes: "Linearisation | None" = None,
 ) -> Fit:
     """Steps of Levenberg and Marquardt from a fit, until one lowers the cost by less than 0.3, a
     fraction of what a change of the unknowns by their deviation does, or by less than 2e-5 of it.
     The cost is infinite if the simulation diverges at the fit.
 
+    Where the cost falls as the linear problem says, the next step has the same derivatives, which
+    cost dozens of simulations: the simplified method of Newton (Deuflhard 2004, "Newton methods for
+    nonlinear problems").
+
     Args:
       stages: those whose unknowns may change; of none, the starts alone.
       weights: of the measurements [S, M].
+      iterations: how many times the derivatives are taken.
       free_states: which entries [D] of the starts may change; all by default.
+      slopes: the derivatives for the first step, from `differentiate`.
     """
+    given = [] if slopes is None else [slopes]
+    return minimise_each(problem, [fit], stages, weights, iterations, free_states, given)[0]
+
+
+def minimise_each(
+    problem: Problem,
+    fits: Sequence[Fit],
+    stages: Sequence[str],
+    weights: np.ndarray,
+    iterations: int,
+    free_states: np.ndarray | None = None,
+    slopes: Sequence["Linearisation"] = (),
+) -> list[Fit]:
+    """`minimise` from several fits, whose windows are simulated together: a few windows of one
+    alone would leave most lanes of a simulation empty.
+
+    Args:
+      slopes: for each fit, the derivatives for its first step; none by default.
+    """
+    searches = []
+    for i, fit in enumerate(fits):
+        given = slopes[i] if slopes else None
+        search = _search(problem, fit, stages, weights, iterations, free_states, given)
+        searches.append(search)
+    return _run_together(problem, searches)
+
+
+_Request = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""What is to be simulated: the arguments of `Simulate`."""
+
+
+def _run_together(problem: Problem, searches: Sequence[Generator[_Request, np.ndarray, Any]]):
+    """What each of the searches returns; each of them yields what it wants to have simulated."""
+    results: list[Any] = [None] * len(searches)
+    answers: dict[int, np.ndarray | None] = dict.fromkeys(range(len(searches)))
+    while answers:
+        requests: dict[int, _Request] = {}
+        for i, answer in answers.items():
+            try:
+                requests[i] = searches[i].send(answer)
+            except StopIteration as end:
+                results[i] = end.value
+        answers = {}
+        if requests:
+            vectors, states, used = map(np.concatenate, zip(*requests.values(), strict=True))
+            outcome = problem.simulate(vectors, states, used)
+            ends = np.cumsum([len(request[0]) for request in requests.values()])
+            for i, part in zip(requests, np.split(outcome, ends[:-1]), strict=True):
+                # Where a candidate does not count, it has the numbers of its search's first.
+                answers[i] = np.where(requests[i][2][:, :, None], part, part[0])
+    return results
+
+
+def _search(
+    problem: Problem,
+    fit: Fit,
+    stages: Sequence[str],
+    weights: np.ndarray,
+    iterations: int,
+    free_states: np.ndarray | None,
+    slopes: "Linearisation | None",
+) -> Generator[_Request, np.ndarray, Fit]:
+    """The steps of `minimise`."""
     layout = problem.layout
-    guess = problem.windows.starts
-    deviations, _, searched = problem.scale_starts()
-    unknowns = np.flatnonzero(layout.free(stages))
-    entries = np.flatnonzero(searched if free_states is None else searched & free_states)
-    # The start of a window that does not count stays as it is.
     used = np.any(weights > 0.0, axis=1)
-    windows = np.arange(len(guess))
-
-    def data_costs(white: np.ndarray, states: np.ndarray) -> np.ndarray:
-        """Half the sum of squares of each candidate and window [C, S]."""
-        squares = np.sum(((states - guess) / deviations) ** 2, axis=2)
-        return 0.5 * (np.sum(white**2, axis=2) + squares)
-
-    def prior_costs(vectors: np.ndarray) -> np.ndarray:
-        return 0.5 * np.sum(((vectors - layout.mean) / layout.deviation) ** 2, axis=-1)
-
+    unknowns, entries = _searched(problem, stages, free_states)
     for iteration in range(iterations):
-        vector = fit.vector
-        starts = fit.starts
-        line = linearise(problem, vector, starts, unknowns, entries, weights)
-        if not np.all(np.isfinite(line.white)):
-            # The simulation diverges.
-            return Fit(vector, starts, line.predicted, weights, np.inf)
-        now = float(np.sum(data_costs(line.white[None], starts[None])) + prior_costs(vector))
-        fit = Fit(vector, starts, line.predicted, weights, now)
-        vectors, states = _list_trials(problem, fit, line, unknowns, entries, used)
-        outcome = problem.simulate(vectors, states, np.tile(used, (len(vectors), 1)))
-        costs = data_costs(problem.whiten(outcome, weights), states)
-        costs = np.where(np.isfinite(costs), costs, np.inf).reshape(len(_DAMPINGS), -1, len(starts))
-        totals = np.sum(np.min(costs, axis=1), axis=1) + prior_costs(vectors[:: len(_SHARES)])
-        damping = int(np.argmin(totals))
-        total = float(totals[damping])
-        problem.progress(f"step {iteration + 1}: {now:.1f} -> {total:.1f}")
-        if now > total:
-            # Of the best damping, each window takes the share that suits it.
-            best = damping * len(_SHARES) + np.argmin(costs[damping], axis=0)
-            fit = Fit(
-                # All shares of a damping have the same unknowns.
-                vector=vectors[damping * len(_SHARES)],
-                starts=states[best, windows],
-                predicted=outcome[best, windows],
-                weights=weights,
-                cost=total,
+        if slopes is None:
+            line = yield from _linearise(
+                problem, fit.vector, fit.starts, unknowns, entries, weights
             )
-        if not now - total >= max(_CONVERGED, _CONVERGED_SHARE * now):
-            break
+        else:
+            outcome = yield fit.vector[None], fit.starts[None], used[None]
+            line = _move(problem, slopes, outcome, weights, len(unknowns))
+            slopes = None
+        for reuse in range(_REUSES):
+            if not np.all(np.isfinite(line.white)):
+                # The simulation diverges.
+                return Fit(fit.vector, fit.starts, line.predicted, weights, np.inf)
+            costs = _window_costs(problem, line.white[None], fit.starts[None])
+            now = float(np.sum(costs)) + _prior_cost(layout, fit.vector)
+            fit = Fit(fit.vector, fit.starts, line.predicted, weights, now)
+            least = max(_CONVERGED, _CONVERGED_SHARE * now)
+            trials = _list_trials(problem, fit, line, unknowns, entries, used)
+            if trials.expected < least:
+                return fit
+            outcome = yield trials.vectors[:1], trials.states[:1], used[None]
+            tried, white = _first_of(problem, trials, outcome, weights)
+            as_expected = now - tried.cost >= _AS_EXPECTED * trials.expected
+            if reuse == 0 and not as_expected:
+                each = np.tile(used, (len(trials.vectors), 1))
+                outcome = yield trials.vectors, trials.states, each
+                tried = _best_of(problem, trials, outcome, weights)
+            problem.progress(f"step {iteration + 1}: {now:.1f} -> {tried.cost:.1f}")
+            fit = min(fit, tried, key=lambda x: x.cost)
+            if reuse == 0 and now - tried.cost < least:
+                return fit
+            if not as_expected:
+                break
+            line = line._replace(predicted=fit.predicted, white=white)
     return fit
+
+
+def differentiate(
+    problem: Problem,
+    fit: Fit,
+    stages: Sequence[str],
+    weights: np.ndarray,
+    free_states: np.ndarray | None = None,
+) -> "Linearisation":
+    """The derivatives at a fit for searches of several sets of windows: see `minimise`."""
+    unknowns, entries = _searched(problem, stages, free_states)
+    return linearise(problem, fit.vector, fit.starts, unknowns, entries, weights)
+
+
+def _searched(
+    problem: Problem, stages: Sequence[str], free_states: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Indices of the unknowns [F] and of the entries of the starts [D] that may change."""
+    searched = problem.scale_starts()[2]
+    if free_states is not None:
+        searched = searched & free_states
+    return np.flatnonzero(problem.layout.free(stages)), np.flatnonzero(searched)
+
+
+def _move(
+    problem: Problem,
+    slopes: "Linearisation",
+    outcome: np.ndarray,
+    weights: np.ndarray,
+    num_free: int,
+) -> "Linearisation":
+    """What was simulated at a fit [1, S, M], with derivatives that were taken near it: of all the
+    windows, or of more, by the same unknowns, or by none."""
+    used = np.any(weights > 0.0, axis=1)
+    by_unknown = slopes.by_unknown[:, :, :num_free]
+    return Linearisation(
+        predicted=outcome[0],
+        white=problem.whiten(outcome, weights)[0],
+        by_unknown=by_unknown * used[:, None, None],
+        by_state=slopes.by_state * used[:, None, None],
+    )
+
+
+def _window_costs(problem: Problem, white: np.ndarray, states: np.ndarray) -> np.ndarray:
+    """Half the sum of squares of each candidate and window [C, S]."""
+    deviations = problem.scale_starts()[0]
+    squares = np.sum(((states - problem.windows.starts) / deviations) ** 2, axis=2)
+    return 0.5 * (np.sum(white**2, axis=2) + squares)
+
+
+def _prior_cost(layout: Layout, vector: np.ndarray) -> float:
+    return 0.5 * float(np.sum(((vector - layout.mean) / layout.deviation) ** 2))
+
+
+def _first_of(
+    problem: Problem, trials: "_Trials", outcome: np.ndarray, weights: np.ndarray
+) -> tuple[Fit, np.ndarray]:
+    """The whole step without damping, of which [1, S, M] was simulated, and its white residuals
+    [S, M]."""
+    vector = trials.vectors[0]
+    white = problem.whiten(outcome, weights)
+    costs = _window_costs(problem, white, trials.states[:1])
+    cost = float(np.sum(costs)) + _prior_cost(problem.layout, vector)
+    cost = cost if np.isfinite(cost) else np.inf
+    return Fit(vector, trials.states[0], outcome[0], weights, cost), white[0]
+
+
+def _best_of(problem: Problem, trials: "_Trials", outcome: np.ndarray, weights: np.ndarray) -> Fit:
+    """The best step, of which [C, S, M] was simulated: of the best damping, each window takes the
+    share that suits it."""
+    vectors, states, _ = trials
+    windows = np.arange(states.shape[1])
+    costs = _window_costs(problem, problem.whiten(outcome, weights), states)
+    costs = np.where(np.isfinite(costs), costs, np.inf)
+    costs = costs.reshape(len(_DAMPINGS), -1, len(windows))
+    # All shares of a damping have the same unknowns.
+    of_prior = [_prior_cost(problem.layout, vector) for vector in vectors[:: len(_SHARES)]]
+    totals = np.sum(np.min(costs, axis=1), axis=1) + of_prior
+    damping = int(np.argmin(totals))
+    best = damping * len(_SHARES) + np.argmin(costs[damping], axis=0)
+    return Fit(
+        vector=vectors[damping * len(_SHARES)],
+        starts=states[best, windows],
+        predicted=outcome[best, windows],
+        weights=weights,
+        cost=float(totals[damping]),
+    )
+
+
+class _Trials(NamedTuple):
+    """What a step tries: for each damping, each share of the change of the starts."""
+
+    vectors: np.ndarray
+    """The unknowns [C, P]."""
+    states: np.ndarray
+    """The starts [C, S, D]."""
+    expected: float
+    """By how much the cost falls with the first of them, without damping and whole, if the problem
+    is linear."""
 
 
 def _list_trials(
     problem: Problem,
     fit: Fit,
-    line: "_Linearisation",
+    line: "Linearisation",
     unknowns: np.ndarray,
     entries: np.ndarray,
     used: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
-    """The unknowns [C, P] and the starts [C, S, D] that a step tries: for each damping, each share
-    of the change of the starts.
+) -> _Trials:
+    """What a step tries.
 
     Args:
       line: derivatives by the F `unknowns` and the D `entries` of the starts that may change.
@@ -288,7 +450,13 @@ def _list_trials(
             starts[:, entries] += share * moved
             vectors.append(vector)
             states.append(np.clip(starts, guess - farthest, guess + farthest))
-    return np.stack(vectors), np.stack(states)
+    changes = (vectors[0] - fit.vector)[unknowns]
+    moves = (states[0] - fit.starts)[:, entries]
+    white = line.white + line.by_unknown @ changes
+    white += np.einsum("smd,sd->sm", line.by_state, moves)
+    left = np.sum(_window_costs(problem, white[None], states[0][None]))
+    expected = fit.cost - float(left) - _prior_cost(layout, vectors[0])
+    return _Trials(np.stack(vectors), np.stack(states), expected)
 
 
 def _bounded_step(hessian: np.ndarray, slope: np.ndarray, room: np.ndarray) -> np.ndarray:
@@ -310,7 +478,7 @@ def _bounded_step(hessian: np.ndarray, slope: np.ndarray, room: np.ndarray) -> n
     return inside.x
 
 
-class _Linearisation(NamedTuple):
+class Linearisation(NamedTuple):
     """The residuals at a point, and their derivatives by differences."""
 
     predicted: np.ndarray
@@ -389,7 +557,7 @@ def linearise(
     entries: np.ndarray,
     weights: np.ndarray,
     size: float = 1.0,
-) -> _Linearisation:
+) -> Linearisation:
     """White residuals r, and derivatives (r(x + h e) - r(x)) / h by the F `unknowns` and the D
     `entries` of the starts, where h is `size` times the step of each.
 
@@ -400,6 +568,20 @@ def linearise(
     all starts gives the column of each window. Where the rows of the angles and of the pictures
     need different steps (`Unknown.ball_step`), each have their own simulation.
     """
+    search = _linearise(problem, vector, starts, unknowns, entries, weights, size)
+    return _run_together(problem, [search])[0]
+
+
+def _linearise(
+    problem: Problem,
+    vector: np.ndarray,
+    starts: np.ndarray,
+    unknowns: np.ndarray,
+    entries: np.ndarray,
+    weights: np.ndarray,
+    size: float = 1.0,
+) -> Generator[_Request, np.ndarray, Linearisation]:
+    """`linearise`, as a part of a search."""
     num_free = len(unknowns)
     differences = []
     used = [np.any(weights > 0.0, axis=1)]
@@ -415,7 +597,7 @@ def linearise(
         vectors[i, unknowns[difference.columns[is_unknown]]] += difference.steps[is_unknown]
         at = entries[difference.columns[~is_unknown] - num_free]
         states[i][:, at] += difference.steps[~is_unknown]
-    predicted = problem.simulate(vectors, states, np.array(used))
+    predicted = yield vectors, states, np.array(used)
     white = problem.whiten(predicted, weights)
     # A window whose simulation diverges there has no derivative.
     changed = np.where(np.isfinite(white), white, white[0])
@@ -424,7 +606,7 @@ def linearise(
         changes = zip(difference.columns, difference.steps, difference.rows, strict=True)
         for column, step, rows in changes:
             jacobian[:, rows, column] = (changed[i] - white[0])[:, rows] / step
-    return _Linearisation(
+    return Linearisation(
         predicted=predicted[0],
         white=white[0],
         by_unknown=jacobian[:, :, :num_free],

@@ -8,12 +8,14 @@ import numpy as np
 
 from bounce_mjx.errors import UserError
 from bounce_mjx.identify.arm import Given, explain_arm
-from bounce_mjx.identify.ball import check_frame, fit_ball
+from bounce_mjx.identify.ball import check_frame, fit_ball, touch_height
 from bounce_mjx.identify.fit import (
     Fit,
+    Linearisation,
     Noise,
     Problem,
     angle_weights,
+    differentiate,
     joint_errors,
     minimise,
     seen_windows,
@@ -32,7 +34,7 @@ from bounce_mjx.identify.log import Log, least_age, straighten
 from bounce_mjx.identify.response import measure_response
 from bounce_mjx.identify.sensors import sensor_noise
 from bounce_mjx.identify.servos import servos_of
-from bounce_mjx.identify.simulation import Simulated, make_simulator
+from bounce_mjx.identify.simulation import Simulate, Simulated, make_simulator
 from bounce_mjx.identify.unknowns import OF_SERVOS, Layout
 from bounce_mjx.identify.windows import Windows, cut_enough, held_out_rows
 from bounce_mjx.robot.model import joint_names
@@ -75,6 +77,9 @@ class Identified(NamedTuple):
     """Whether the log's targets are a controller's own set points."""
     stamp_age: float = 0.0
     """Time from a picture's stamp to its arrival, s: `ball_latency` in the fit is without it."""
+
+    touch_height: float = 0.0
+    """By how much higher than on the model's paddle the measured ball touches it, m."""
 
     @property
     def deviation(self) -> np.ndarray:
@@ -154,20 +159,24 @@ def identify(
         problem, fit, pictures = fit_ball(problem, fit, make)
         stages = [*stages, "flight", "bounce"]
         free_states = None
-    if choice.chosen.has_servos and np.max(problem.correlation) < _FEW_ALIKE:
-        finer = _halve_steps(config)
-        layout = Layout(config.num_joints, with_ball, finer.physics_dt, camera_rotation)
-        problem, fit = _in_finer_steps(problem, fit, layout, finer, log)
     progress("all")
-    fit, unseen = _fit_all(problem, fit, pictures, stages, free_states)
+    in_steps = problem
+    finer = None
+    if choice.chosen.has_servos and np.max(problem.correlation) < _FEW_ALIKE:
+        finer = _finer_steps(problem, config, camera_rotation, log)
+        problem = _correct(in_steps, fit, finer)
+    fit, unseen, slopes = _fit_all(problem, fit, pictures, stages, free_states)
+    if finer is not None:
+        problem = _correct(in_steps, fit, finer)
+        fit = minimise(problem, fit, stages, fit.weights, 1, free_states, slopes)
     if not fit.cost < np.inf:
         raise UserError(
             f"the simulation of {log.source} diverges with {config.physics_dt:g} s steps; take a "
             "smaller physics_dt in the robot's config"
         )
     nominals = model_nominals(config)
-    known = {name: nominals[name] for name in layout.terms if name in nominals}
-    nominal_vector = own.layout.vector(known)
+    nominal = {name: nominals[name] for name in layout.terms if name in nominals}
+    nominal_vector = own.layout.vector(nominal)
     before = fit._replace(predicted=own.predict(nominal_vector, fit.starts))
     is_estimated = layout.free(stages)
     is_chosen = np.zeros_like(is_estimated)
@@ -179,12 +188,17 @@ def identify(
             is_chosen[layout.terms[name]] = True
     counts = np.any(windows.split(fit.weights)[1] > 0.0, axis=(1, 2))
     by_sensor = problem._replace(noise=sensors, correlation=1.0)
+    known = certainty(problem, fit, is_estimated, is_chosen)
+    if finer is not None:
+        # Latency and lag are the same; their delay and its variance depend on the lag's steps.
+        fit = fit._replace(vector=finer.layout.vector(layout.world(fit.vector)))
+        layout = finer.layout
     return Identified(
         layout=layout,
         windows=windows,
         noise=sensors,
         fit=fit,
-        certainty=certainty(problem, fit, is_estimated, is_chosen),
+        certainty=known,
         before=_measure_errors(by_sensor, before),
         after=_measure_errors(by_sensor, fit),
         held_out=_measure_errors(by_sensor, unseen),
@@ -195,20 +209,44 @@ def identify(
         simulated=problem.simulated,
         has_set_points=given.has_set_points,
         stamp_age=least_age(log),
+        touch_height=touch_height(config, windows, layout.world(fit.vector)) if with_ball else 0.0,
     )
 
 
-def _in_finer_steps(
-    problem: Problem, fit: Fit, layout: Layout, config: WorldConfig, log: Log
-) -> tuple[Problem, Fit]:
-    """The problem and its fit in the physics steps of another config, for which `layout` is:
-    windows and simulation have two in place of one."""
-    # Latency and lag are the same; their delay and its variance depend on the lag's steps.
-    world = problem.layout.world(fit.vector)
+class _Finer(NamedTuple):
+    """A problem's windows, simulated in steps of half the length."""
+
+    simulate: Simulate
+    layout: Layout
+
+
+def _finer_steps(problem: Problem, config: WorldConfig, camera_rotation: float, log: Log) -> _Finer:
+    """The finer steps of a problem.
+
+    A real robot has no steps. With those of a training, gains and frictions would make good for the
+    length of a step, by up to four standard deviations of what a minute's log shows.
+    """
+    finer = config.model_copy(update={"physics_dt": 0.5 * config.physics_dt})
+    with_ball = "restitution" in problem.layout.unknowns
+    layout = Layout(config.num_joints, with_ball, finer.physics_dt, camera_rotation)
     windows = problem.windows.finer()
-    simulate = make_simulator(config, layout, log, windows, problem.simulated)
-    problem = problem._replace(simulate=simulate, layout=layout)
-    return problem, fit._replace(vector=layout.vector(world))
+    simulate = make_simulator(finer, layout, log, windows, problem.simulated, runs_once=True)
+    return _Finer(simulate, layout)
+
+
+def _correct(problem: Problem, fit: Fit, finer: _Finer) -> Problem:
+    """The problem with what finer steps change at a fit added to what is simulated: the principle
+    of defect correction (Stetter 1978). The search itself stays in the steps of a training."""
+    vector = finer.layout.vector(problem.layout.world(fit.vector))
+    every = np.ones((1, len(fit.starts)), bool)
+    in_finer = finer.simulate(vector[None], fit.starts[None], every)[0]
+    change = in_finer - problem.predict(fit.vector, fit.starts)
+    change = np.where(np.isfinite(change), change, 0.0)
+
+    def simulate(vectors: np.ndarray, starts: np.ndarray, used: np.ndarray) -> np.ndarray:
+        return problem.simulate(vectors, starts, used) + change
+
+    return problem._replace(simulate=simulate)
 
 
 def _fit_all(
@@ -217,9 +255,9 @@ def _fit_all(
     pictures: np.ndarray,
     stages: Sequence[str],
     free_states: np.ndarray | None,
-) -> tuple[Fit, Fit]:
-    """The fit to all windows; and the one before it, of the windows that the search sees, with the
-    best starts of the others.
+) -> tuple[Fit, Fit, Linearisation]:
+    """The fit to all windows; the one before it, of the windows that the search sees, with the best
+    starts of the others; and the derivatives of all.
 
     Args:
       pictures: weights of the pictures [S, B].
@@ -230,18 +268,11 @@ def _fit_all(
     of_seen = problem.weights(pictures, seen, angles)
     of_unseen = problem.weights(pictures, 1.0 - seen, angles)
     of_all = problem.weights(pictures, 1.0, angles)
-    fit = minimise(problem, fit, stages, of_seen, 3, free_states)
-    unseen = minimise(problem, fit, [], of_unseen, 3, free_states)
-    return minimise(problem, unseen, stages, of_all, 3, free_states), unseen
-
-
-def _halve_steps(config: WorldConfig) -> WorldConfig:
-    """The robot in physics steps of half the length.
-
-    A real robot has no steps. With those of a training, gains and frictions would make good for the
-    length of a step, by up to four standard deviations of what a minute's log shows.
-    """
-    return config.model_copy(update={"physics_dt": 0.5 * config.physics_dt})
+    slopes = differentiate(problem, fit, stages, of_all, free_states)
+    fit = minimise(problem, fit, stages, of_seen, 2, free_states, slopes)
+    unseen = minimise(problem, fit, [], of_unseen, 3, free_states, slopes)
+    fit = minimise(problem, unseen, stages, of_all, 1, free_states, slopes)
+    return fit, unseen, slopes
 
 
 def _measure_errors(problem: Problem, fit: Fit) -> dict[str, float]:

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bounce_mjx.identify.fit import Fit, Problem, eliminate, linearise
+from bounce_mjx.identify.fit import Fit, Linearisation, Problem, eliminate, linearise
 from bounce_mjx.identify.unknowns import Layout
 
 _RESAMPLES = 400
@@ -50,8 +50,8 @@ def certainty(
     noisy, and J_s' J_s would count their noise as information. J1 and J2, by central differences
     of one and of two steps, have independent noise, so that A_s = (J1' J2 + J2' J1) / 2 has the
     expectation without noise. Negative eigenvalues of a sum of them count as 0. A window whose J1
-    and J2 differ much has no derivative, and is left out. Angles are smooth: without a ball, A_s is
-    that of the mean of J1 and J2.
+    and J2 differ much has no derivative, and is left out. Angles are smooth: without a ball, J2 is
+    J1.
 
     *Few windows.* A fit adapts to each block: its residuals have the covariance I - H_s in place
     of I, where H_s = R' A_s R with (A + I)^-1 = R R' is the block's leverage. Its gradient is
@@ -69,19 +69,25 @@ def certainty(
     scale = layout.deviation
     reach = deviations[entries]
     vector = layout.interior(fit.vector, 2.0)
+    has_ball = problem.windows.has_ball
+    # Angles are smooth, and those of the arm alone need one step.
+    of_balls = fit.weights * has_ball[:, None]
+    sides = [(1.0, fit.weights), (-1.0, fit.weights), (2.0, of_balls), (-2.0, of_balls)]
     lines = [
-        linearise(problem, vector, fit.starts, np.arange(size), entries, fit.weights, step)
-        for step in (1.0, -1.0, 2.0, -2.0)
+        linearise(problem, vector, fit.starts, np.arange(size), entries, weights, step)
+        for step, weights in sides
     ]
-    central = [0.5 * (a.by_unknown + b.by_unknown) * scale for a, b in (lines[:2], lines[2:])]
+    ones = _mean(lines[:2])
+    twos = _mean(lines[2:])
+    twos = [np.where(has_ball[:, None, None], b, a) for a, b in zip(ones, twos, strict=True)]
     reduced = eliminate(
         problem.whiten(fit.predicted, fit.weights),
-        np.concatenate(central, axis=2),
-        np.mean([line.by_state for line in lines], axis=0) * reach,
+        np.concatenate([ones[0], twos[0]], axis=2) * np.tile(scale, 2),
+        0.5 * (ones[1] + twos[1]) * reach,
         (fit.starts - problem.windows.starts)[:, entries] / reach,
     )
     counts = ~(_has_no_derivative(reduced.informations, layout) & problem.windows.has_ball)
-    informations = _informations(reduced.informations, problem.windows.has_ball)
+    informations = _symmetrise(reduced.informations[:, :size, size:])
     informations *= counts[:, None, None]
     gradients = np.mean(np.split(reduced.gradients * counts[:, None], 2, axis=1), axis=0)
     if is_chosen is not None:
@@ -93,12 +99,11 @@ def certainty(
     return Certainty(information / np.outer(scale, scale), changes)
 
 
-def _informations(products: np.ndarray, has_ball: np.ndarray) -> np.ndarray:
-    """A_s [S, P, P], from the products [S, 2 P, 2 P] of [J1, J2]."""
-    size = products.shape[1] // 2
-    cross = _symmetrise(products[:, :size, size:])
-    own = products[:, :size, :size] + products[:, size:, size:]
-    return np.where(has_ball[:, None, None], cross, 0.25 * own + 0.5 * cross)
+def _mean(lines: list[Linearisation]) -> tuple[np.ndarray, np.ndarray]:
+    """Central differences by the unknowns and by the starts, from both sides."""
+    forward, backward = lines
+    by_unknown = 0.5 * (forward.by_unknown + backward.by_unknown)
+    return by_unknown, 0.5 * (forward.by_state + backward.by_state)
 
 
 def resample(

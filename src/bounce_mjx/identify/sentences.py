@@ -26,6 +26,9 @@ _GOOD_DISTANCE = 3e-3
 _MUCH_BETTER = 0.7
 # Share of the windows with a ball from which its bounces count.
 _MOST_FLY = 0.5
+# Height by which the ball touches the paddle beside the model's beyond which it is named: half of a
+# ball's radius, m.
+_HEIGHT_OFF = 0.01
 # Deviations of the prior beyond which an estimate is a mistake, and what is likely to be wrong.
 _SURPRISING = 3.0
 # Distance from a limit of the search within which an estimate is at it, in the same deviations.
@@ -49,6 +52,14 @@ def sentences(found: Identified, joint_names: Sequence[str]) -> list[str]:
         said.append(
             "The ball leaves the paddle at once, as a real one does; in the world it stays for the "
             "model's contact, and leaves as fast."
+        )
+    if abs(found.touch_height) > _HEIGHT_OFF:
+        side = "above" if found.touch_height > 0.0 else "below"
+        said.append(
+            f"warning: in the log, the ball touches the paddle {1e3 * abs(found.touch_height):.0f} "
+            f"mm {side} the model's; look at the height of the ball's frame, at the paddle's "
+            "thickness and mounting, and at the joints' zeros, among which ball_position_bias, "
+            "paddle_offset and encoder_bias share it."
         )
     if found.dropped and found.dropped <= _MOST_FLY * np.sum(found.windows.has_ball):
         said.append(

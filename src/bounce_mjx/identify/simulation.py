@@ -3,7 +3,7 @@ training."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import NamedTuple
 
 import jax
@@ -60,14 +60,19 @@ def make_simulator(
     log: Log,
     windows: Windows,
     simulated: Simulated = NOTHING_ELSE,
+    runs_once: bool = False,
 ) -> Simulate:
     """Builds the simulation of a log's windows in candidate worlds.
 
     Measured angles are the true ones plus `encoder_bias`, which the servos share. A measured ball
     is the true one, `ball_latency` before its time stamp, turned by the camera's rotation about
     the middle of all measured ones, plus `ball_position_bias`.
+
+    Args:
+      runs_once: whether it simulates each window once or twice, so that compiling takes longer than
+        running.
     """
-    run = _compile(config, layout.num_joints)
+    run = _compile(config, layout.num_joints, runs_once)
     contact_time = _contact_time(config) if simulated.leaves_at_once else 0.0
     # By how much the paddle has moved in the time for which the ball does not stay on it.
     paddle_rise = contact_time * _paddle_speeds(config, windows)
@@ -170,7 +175,9 @@ def compensated(config: WorldConfig) -> WorldConfig:
 
 
 @lru_cache(8)
-def _compile(config: WorldConfig, n: int) -> Callable[..., tuple[jax.Array, jax.Array]]:
+def _compile(
+    config: WorldConfig, n: int, runs_once: bool = False
+) -> Callable[..., tuple[jax.Array, jax.Array]]:
     """The part of a simulation that is compiled, which is the same for all logs: angles
     [A, n, L], rad, and balls [B, 3, L], m."""
     own = world_model(config, visual=False)
@@ -209,7 +216,11 @@ def _compile(config: WorldConfig, n: int) -> Callable[..., tuple[jax.Array, jax.
         speed = jnp.take_along_axis(speeds, step[:, None], axis=0)
         return near + speed * (times - step * dt)[:, None]
 
-    @jax.jit
+    # On a CPU, LLVM takes most of the time to compile it.
+    is_quick = runs_once and jax.default_backend() == "cpu"
+    options = {"xla_backend_optimization_level": 0} if is_quick else {}
+
+    @partial(jax.jit, compiler_options=options)
     def run(
         world,
         starts,

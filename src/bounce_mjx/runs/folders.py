@@ -47,7 +47,6 @@ from bounce_mjx.resources import (
     policy_folder,
     resource_path,
 )
-from bounce_mjx.runs import earlier
 from bounce_mjx.runs.config import (
     CONFIG_FILE,
     ROBOT,
@@ -290,8 +289,7 @@ def best_checkpoint(
         record = records[checkpoint]
         # One without an evaluation is below any.
         score = record.report.score if record and record.report else ()
-        # Version 0.1.0 wrote no evaluation of a policy that it shipped.
-        return score, checkpoint.folder.parent.name == earlier.BEST, checkpoint.number
+        return score, checkpoint.number
 
     return max(records, key=quality)
 
@@ -415,8 +413,6 @@ def stored_checkpoints(run: Path) -> list[Checkpoint]:
     with contextlib.suppress(OSError), os.scandir(folder) as entries:
         # One look, as a training may remove them meanwhile.
         paths = [folder / entry.name for entry in entries if entry.name.isdecimal()]
-    if not paths:
-        paths = earlier.checkpoints_in(folder)
     return [Checkpoint(run, path, int(path.name)) for path in paths if path.is_dir()]
 
 
@@ -427,7 +423,8 @@ def _checkpoints_in(run: Path, place: Path) -> list[Checkpoint]:
     inside = [checkpoint for checkpoint in stored if checkpoint.folder.is_relative_to(place)]
     if not stored:
         raise UserError(
-            f"{run} has no checkpoint, as its training ended before the first one; start again"
+            f"{run} has no checkpoint, as its training ended before the first one or another "
+            "version wrote it; start again"
         )
     if not inside:
         raise UserError(f"{place} holds no checkpoint of its run; give {run}, or one of its own")
