@@ -59,7 +59,14 @@ from bounce_mjx.resources import (
     policy_path,
     resource_path,
 )
-from bounce_mjx.runs.config import CONFIG_FILE, ROBOT, TrainConfig, dump_sources, runs_folder
+from bounce_mjx.runs.config import (
+    CONFIG_FILE,
+    ROBOT,
+    TrainConfig,
+    dump_sources,
+    load_run_config,
+    runs_folder,
+)
 from bounce_mjx.runs.presets import BASE
 from bounce_mjx.runs.progress import load_results
 from bounce_mjx.runs.records import Checkpoint, DamagedCheckpoint, Record, verify
@@ -382,8 +389,18 @@ def choose_checkpoint(
     if run != path:
         results = load_results(_best_seed(run))
         known = results.best.summary if results else "not evaluated"
-        tell(f"using the newest run: {run} ({known})")
+        tell(f"using the newest run: {run}{_arm_of(run)} ({known})")
     return find_checkpoint(run)
+
+
+def _arm_of(run: Path) -> str:
+    """The arm of a run in words, as a folder has the runs of all arms; empty for the project's own,
+    and for a run whose config cannot be read."""
+    try:
+        mjcf = load_run_config(run).env.mjcf
+    except UserError:
+        return ""
+    return "" if mjcf is None else f" of the arm in {mjcf.parent.name}/{mjcf.name}"
 
 
 def _policy_of_folder(log_dir: Path) -> str | None:
