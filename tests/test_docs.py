@@ -188,8 +188,9 @@ def known_flags() -> set[str]:
             is_command = inspect.isclass(member) and issubclass(member, StrictModel)
             if is_command and name.endswith("Command"):
                 flags |= set(cli.flags_of(fields_in(member)))
-    import_code(CHECKOUT / "examples/dribble_task.py")
-    for task in (Bounce, find_task("dribble")):
+    for example in EXCERPTS.values():
+        import_code(CHECKOUT / example)
+    for task in (Bounce, find_task("dribble"), find_task("line")):
         flags |= {f"--{name}".replace("_", "-") for name in task.Config().goals}
     return flags
 
@@ -228,12 +229,18 @@ def test_what_a_page_imports_is_in_a_reference(imported: tuple[str, str]) -> Non
     module, name = imported
     documented = set(re.findall(r"^\| \[`\S+\.(\w+)`\]", content("api.md"), re.MULTILINE))
     try:
+        # A module of a package is its attribute only once it is imported.
+        is_package = importlib.util.find_spec(module).submodule_search_locations is not None
+        if is_package and importlib.util.find_spec(f"{module}.{name}") is not None:
+            importlib.import_module(f"{module}.{name}")
         member = getattr(importlib.import_module(module), name, None)
     except MissingPackage as missing:
         pytest.skip(str(missing))
     is_setting = inspect.isclass(member) and issubclass(member, StrictModel)
     is_type = module == "bounce_mjx.config.settings"
-    is_elsewhere = inspect.ismodule(member) or is_setting or is_type or member is Bounce
+    folder = getattr(importlib.import_module(module), "__path__", None)
+    is_module = folder is not None and name in {info.name for info in pkgutil.iter_modules(folder)}
+    is_elsewhere = is_module or is_setting or is_type or member is Bounce
     assert is_elsewhere or name in documented
 
 
@@ -263,6 +270,7 @@ def test_table_of_libraries_names_every_example_and_existing_tests() -> None:
     examples = {path.name for path in (CHECKOUT / "examples").glob("*.*")} - {
         "deploy.py",
         "dribble_task.py",
+        "line_task.py",
         "two_cameras.py",
         "smooth_ppo.py",
         "ur_rtde_bridge.py",
@@ -442,6 +450,9 @@ def short_training(folder: Path) -> Callable:
     return train
 
 
+# Pages whose Python is of a file.
+EXCERPTS = {"tasks.md": "examples/dribble_task.py", "tutorial.md": "examples/line_task.py"}
+
 # test_examples.py and test_deploy.py run the most of real-robot.md.
 SLOW_PAGES = "libraries.md", "real-robot.md", "training.md"
 
@@ -471,8 +482,8 @@ def test_python_of_a_page_runs(page: str, capsys, tmp_path: Path, monkeypatch, r
             request.getfixturevalue(fixture)
     names: dict = {"traced": traced}
     for example in examples(page, "python"):
-        if page == "tasks.md":
-            assert example in (CHECKOUT / "examples/dribble_task.py").read_text("utf-8")
+        if page in EXCERPTS:
+            assert example in (CHECKOUT / EXCERPTS[page]).read_text("utf-8")
             continue
         example = example.replace("jax.jit", "traced")
         example = example.replace(

@@ -111,7 +111,7 @@ class Scores:
     def __call__(self, config, env, mesh, pool) -> "Scores":
         return self
 
-    def select(self, policies) -> list[Report]:
+    def select(self, policies, progresses) -> list[Report]:
         return [self.report(seed, policy) for seed, policy in enumerate(policies)]
 
     def report(self, seed: int, policy) -> Report:
@@ -125,7 +125,8 @@ class Scores:
         return Report((result,), details, screening=self.screening)
 
     def final(self, policies) -> list[Report]:
-        return [dataclasses.replace(report, screening=False) for report in self.select(policies)]
+        reports = self.select(policies, None)
+        return [dataclasses.replace(report, screening=False) for report in reports]
 
 
 def train(
@@ -473,10 +474,10 @@ def test_a_signal_saves_and_says_how_to_resume(tmp_path: Path, number: signal.Si
     num_evaluations = 0
 
     class Counted(Scores):
-        def select(self, policies):
+        def select(self, policies, progresses):
             nonlocal num_evaluations
             num_evaluations += 1
-            return super().select(policies)
+            return super().select(policies, progresses)
 
     with pytest.raises(job.TrainingStopped) as stopped:
         train(tmp_path, RETURNS, trainer=signalled, scores=Counted)
@@ -511,10 +512,10 @@ def test_an_evaluation_that_was_stopped_is_repeated(tmp_path: Path) -> None:
     had the steps."""
 
     class Stopped(Scores):
-        def select(self, policies):
+        def select(self, policies, progresses):
             os.kill(os.getpid(), signal.SIGTERM)
             time.sleep(0.5)
-            return super().select(policies)
+            return super().select(policies, progresses)
 
     with pytest.raises(job.TrainingStopped, match="stopped after 64 steps"):
         train(tmp_path, {1: 5.0}, scores=Stopped)

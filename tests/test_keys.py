@@ -174,7 +174,8 @@ def of_run(config: TrainConfig) -> tuple:
             job.steps += job.steps_per_block
         nothing = types.SimpleNamespace(compile=lambda: None)
         patch.setattr(Evaluators, "_lower", lambda _: nothing)
-        patch.setattr(Evaluators, "_measure", lambda *given, **_: measured.append(given[2]))
+        patch.setattr(Evaluators, "_run", lambda *given: measured.append(given[2]))
+        patch.setattr(Evaluators, "_judge", lambda *_: None)
         evaluators = Evaluators(config, job.env, job.trainer.mesh, job.pool)
         evaluators.final(None)
         seeds, task = str(job.trainer._seeds), type(job.env.task).__name__

@@ -204,16 +204,6 @@ def test_only_the_figures_that_are_numbers_count(tmp_path: Path) -> None:
         read_curves(run)
 
 
-def test_a_log_of_an_earlier_version_has_the_present_names(tmp_path: Path) -> None:
-    """Also where its training was resumed with this one."""
-    scalars = {"episode/bounces": {1: 2.0, 2: 3.0}, "episode/bounces_at_end": {2: 4.0, 3: 5.0}}
-    run = write_run(tmp_path / "run", TrainConfig(), scalars | {"task/n_bounces": {1: 1.0}})
-    curves = read_curves(run).curves
-    assert curves.keys() == {"episode/bounces_at_end", "task/bounces_so_far"}
-    curve = curves["episode/bounces_at_end"]
-    assert (curve.steps.tolist(), curve.values.tolist()) == ([1, 2, 3], [2.0, 4.0, 5.0])
-
-
 def test_the_band_is_one_deviation_around_the_mean(runs: list[Path]) -> None:
     """The band covers the steps that all three seeds reached."""
     seeds = [logged(run, "episode/return") for run in runs[:3]]

@@ -27,6 +27,7 @@ from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.model import fingerprint, load_model
 from bounce_mjx.runs import folders
 from bounce_mjx.runs import presets as presets_module
+from bounce_mjx.runs.checkpoints import read_record
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.folders import (
     best_checkpoint,
@@ -98,26 +99,6 @@ def runs(tmp_path: Path, progress: Progress) -> Path:
     return tmp_path
 
 
-def test_a_config_of_0_1_0_has_settings_that_ended_or_moved(tmp_path: Path) -> None:
-    """Those that change nothing are left out, and others are refused, as no filter runs today."""
-    path = tmp_path / "config.yaml"
-    path.write_text(
-        "env: {estimator: {restitution: 0.8}, observation: {position: measured}, "
-        "randomization: {air_lift: null}, joint_angle_noise: 0.25}\n"
-        "ppo: {min_noise_std: 0.3}"
-    )
-    config = load_run_config(tmp_path)
-    assert config.ppo.mean_noise_bound == 0.3
-    env = config.env
-    assert env.reset.joint_angles == 0.25
-    changed = env.reset.model_copy(update={"joint_angles": TrainConfig().env.reset.joint_angles})
-    assert env.model_copy(update={"reset": changed}) == TrainConfig().env
-    for setting in ("observation: {position: filter}", "randomization: {air_lift: [0, 1]}"):
-        path.write_text(f"env: {{{setting}}}")
-        with pytest.raises(UserError, match=f"unknown key env.{setting.partition(':')[0]}"):
-            load_run_config(tmp_path)
-
-
 @pytest.mark.parametrize("name", [None, Path("latest")])
 def test_the_newest_run_is_introduced(runs: Path, name: Path | None, capsys) -> None:
     """A result that is not judged counts neither as met nor as missed."""
@@ -125,6 +106,14 @@ def test_the_newest_run_is_introduced(runs: Path, name: Path | None, capsys) -> 
     assert capsys.readouterr().out.splitlines() == [
         f"using the newest run: {runs}/2026-01-02 (0 of 4 judged results met)"
     ]
+
+
+def test_the_arm_of_the_newest_run_is_named(runs: Path, capsys) -> None:
+    """The runs of all arms lie in the task's folder."""
+    package = "package:some_arms/panda/robot.xml"
+    (runs / "2026-01-02" / "config.yaml").write_text(f"env: {{mjcf: '{package}'}}")
+    choose_checkpoint(None, runs)
+    assert "2026-01-02 of the arm in panda/robot.xml (0 of 4" in capsys.readouterr().out
 
 
 def test_latest_is_a_name_for_every_command(runs: Path, monkeypatch) -> None:
@@ -167,6 +156,29 @@ def counted(function: Callable, calls: list) -> Callable:
         return function(*arguments)
 
     return count
+
+
+@pytest.mark.parametrize("key", ["env.estimator", "ppo.min_noise_std", "num_robots"])
+def test_a_config_of_another_version_is_one_sentence(key: str, tmp_path: Path) -> None:
+    """And not a guess at what the user has mistyped."""
+    *groups, name = key.split(".")
+    (tmp_path / "config.yaml").write_text(
+        "".join(f"{g}: {{" for g in groups) + f"{name}: 1" + "}" * len(groups)
+    )
+    with pytest.raises(UserError, match=f"has the setting {key}, .*another version.*; train again"):
+        load_run_config(tmp_path)
+
+
+def test_checkpoints_of_another_version_are_one_sentence(runs: Path) -> None:
+    """Of the folders and of the records of one that came before."""
+    run = runs / "2026-01-02"
+    folder = run / "checkpoints/64"
+    (folder / "run.json").write_text("{}")
+    with pytest.raises(UserError, match="checkpoints/64 is damaged or of another version .*; give"):
+        read_record(find_checkpoint(run))
+    folder.rename(run / "checkpoints/best")
+    with pytest.raises(UserError, match="no checkpoint, .* or another version wrote it; start"):
+        find_checkpoint(run)
 
 
 def test_a_run_without_a_checkpoint_is_told_as_such(runs: Path) -> None:

@@ -120,12 +120,6 @@ def own_name(kind: type) -> str:
     return kind.__name__.lower()
 
 
-def plain_name(name: str) -> str:
-    """The name in a file of a time when one was FILE.py:CLASS; any other is returned unchanged."""
-    file, _, class_name = name.rpartition(":")
-    return class_name.lower() if file.endswith(".py") else name
-
-
 def code_file_of(kind: type) -> CodeFile | None:
     """The file of a class; None for one of a notebook or an interpreter."""
     if kind.__module__ in _code_files:

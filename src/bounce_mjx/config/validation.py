@@ -70,6 +70,14 @@ def describe(
     return f"{flags.get(key, key)} is {given}, but {reason.replace('input should', 'must', 1)}"
 
 
+def unknown_key(error: UserError, group: str = "") -> str | None:
+    """The dotted key that a `validate` refused as unknown; None where it refused another thing."""
+    cause = error.__cause__
+    if not isinstance(cause, pydantic.ValidationError):
+        return None
+    return key_of(cause, group) if cause.errors()[0]["type"] == "extra_forbidden" else None
+
+
 def groups_of(fields: Iterable[str]) -> set[str]:
     """The dotted keys of the groups in which settings are, such as env and env.reward."""
     groups = set()

@@ -12,7 +12,7 @@ from typing import Any
 import pydantic
 
 from bounce_mjx.config.settings import merged
-from bounce_mjx.config.user_code import not_imported, plain_name
+from bounce_mjx.config.user_code import not_imported
 from bounce_mjx.config.validation import validate
 from bounce_mjx.deploy.interface import check_interface, interface_of
 from bounce_mjx.env.env import Env
@@ -208,7 +208,7 @@ def _environment_in_file(path: Path, mjcf: Any) -> WorldConfig:
             f"{path} says nothing of its environment, as an earlier version exported it; give the "
             "run's folder or the name of the policy, or export it again"
         )
-    name = plain_name(metadata.task)
+    name = metadata.task
     if not is_task(name):
         raise not_imported(str(path), "task", name, None)
     if values["mjcf"] is not None and not is_packaged(values["mjcf"]):

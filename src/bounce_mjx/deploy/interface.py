@@ -10,7 +10,6 @@ import math
 from pathlib import Path
 from typing import NamedTuple
 
-from bounce_mjx.config.user_code import plain_name
 from bounce_mjx.deploy.metadata import Metadata
 from bounce_mjx.errors import UserError
 from bounce_mjx.task.registry import task_name
@@ -69,7 +68,7 @@ def interface_in(metadata: Metadata) -> Interface:
     names = {"past_actions": "action"}
     parts = [(names.get(part.name, part.name), part.history) for part in metadata.observation]
     return Interface(
-        task=plain_name(metadata.task),
+        task=metadata.task,
         robot=metadata.robot,
         start_pose=metadata.default_joint_angles,
         control_step=metadata.control_dt,

@@ -33,13 +33,6 @@ _LEARNING_RATE = "ppo.learning_rate"
 _MAX_NAMED = 3
 
 
-_EARLIER_TAGS = {
-    "episode/bounces": "episode/bounces_at_end",
-    "task/n_bounces": "task/bounces_so_far",
-}
-"""Names of curves in the logs of earlier versions, and their present ones."""
-
-
 class LoggedCurve(NamedTuple):
     """N points of one quantity over the training."""
 
@@ -87,14 +80,10 @@ def read_curves(run: Path) -> RunCurves:
         raise UserError(
             f"the TensorBoard log in {run} is damaged ({shorten(reason_of(error))}); remove it"
         ) from error
-    logged: dict[str, dict[int, float]] = {}
-    # Those of an earlier version first, as a run may have been resumed with this one.
-    for tag in sorted(log.Tags()["scalars"], key=lambda tag: tag not in _EARLIER_TAGS):
-        # A resumed run may have logged a step twice; the later value belongs to the final policy.
-        values = {event.step: event.value for event in log.Scalars(tag)}
-        logged.setdefault(_EARLIER_TAGS.get(tag, tag), {}).update(values)
     curves = {}
-    for name, values in logged.items():
+    for name in log.Tags()["scalars"]:
+        # A resumed run may have logged a step twice; the later value belongs to the final policy.
+        values = {event.step: event.value for event in log.Scalars(name)}
         finite = {step: value for step, value in values.items() if math.isfinite(value)}
         if finite:
             steps, points = zip(*sorted(finite.items()), strict=True)

@@ -37,7 +37,7 @@ from bounce_mjx.learning.policy import Actor, Policy, make_networks, networks_of
 from bounce_mjx.learning.ppo import PPO, Params, names_of_critic_metrics
 from bounce_mjx.learning.registry import find_algorithm
 from bounce_mjx.learning.statistics import RunningStatistics, init_statistics
-from bounce_mjx.runs import earlier, folders
+from bounce_mjx.runs import folders
 from bounce_mjx.runs.config import (
     CONFIG_FILE,
     RESUMABLE_KEYS,
@@ -130,7 +130,7 @@ def read_training(checkpoint: Checkpoint, template: Any) -> tuple[Any, Record]:
     Args:
       template: shapes and dtypes of the state, as from `jax.eval_shape`.
     """
-    if not (checkpoint.folder / TRAINING).is_dir() or checkpoint.is_old:
+    if not (checkpoint.folder / TRAINING).is_dir():
         raise UserError(f"{checkpoint.folder} has no state to continue from; use --warm-start")
     record = read_record(checkpoint)
     return _read_arrays(checkpoint, TRAINING, template), record
@@ -143,12 +143,7 @@ def read_networks(
     critic metrics among these."""
     # Refuses a damaged one.
     read_record(checkpoint)
-    if (checkpoint.folder / NETWORKS).is_dir():
-        item = NETWORKS
-    elif checkpoint.is_old and (checkpoint.folder / TRAINING).is_dir():
-        # Version 0.1.0 has both networks in its state alone.
-        item = TRAINING
-    else:
+    if not (checkpoint.folder / NETWORKS).is_dir():
         raise UserError(
             f"{checkpoint.folder} is without its value network; give robust_small, or a run"
         )
@@ -162,7 +157,7 @@ def read_networks(
         return {"params": params, "statistics": init_statistics(size + len(names))}
 
     try:
-        stored = _read_arrays(checkpoint, item, jax.eval_shape(initial))
+        stored = _read_arrays(checkpoint, NETWORKS, jax.eval_shape(initial))
     except DamagedCheckpoint as error:
         if config.algorithm == PPO_NAME:
             raise
@@ -232,8 +227,7 @@ def read_record(checkpoint: Checkpoint) -> Record:
     run_config = load_run_config(checkpoint.run)
     record = verify(checkpoint)
     try:
-        stored = earlier.present_settings(record.config)
-        differing = _differing_keys(run_config, stored)
+        differing = _differing_keys(run_config, record.config)
     # Pydantic's own is one.
     except ValueError as error:
         raise DamagedCheckpoint(checkpoint, error) from error
@@ -270,8 +264,7 @@ def _read_arrays(checkpoint: Checkpoint, item: str, template: Any) -> Any:
     """Reads an item of a checkpoint with exactly the structure, shapes and dtypes of `template`."""
     try:
         with plain_path(checkpoint.folder) as folder:
-            read = earlier.read_arrays if checkpoint.is_old else _read_item
-            return read(folder / item, template)
+            return _read_item(folder / item, template)
     # Damaged files raise exceptions of many types.
     except Exception as error:
         raise DamagedCheckpoint(checkpoint, error) from error

@@ -10,7 +10,7 @@ from pydantic.fields import FieldInfo
 
 from bounce_mjx.config.settings import Count, NonNegativeInt, Steps, StrictModel, fields_in
 from bounce_mjx.config.user_code import code_file_of, not_imported
-from bounce_mjx.config.validation import validate
+from bounce_mjx.config.validation import ConfigT, unknown_key, validate
 from bounce_mjx.errors import UserError, warn_once
 from bounce_mjx.evaluation.config import DEFAULT_SEED
 from bounce_mjx.learning.config import PPO_NAME, PPOConfig
@@ -86,7 +86,8 @@ class TrainConfig(StrictModel):
     eval_episodes: Count = 1024
     """Episodes of an evaluation of the results."""
     screening_episodes: NonNegativeInt = 0
-    """Episodes of a cheap first evaluation, which must pass before the full one; 0 for none."""
+    """Episodes with which an evaluation begins; they double as long as the policy may become the
+    best. 0 for all at once."""
     eval_seed: NonNegativeInt = 10_000
     """Seed of the evaluations during training."""
     stop_when_solved: bool = False
@@ -247,8 +248,8 @@ def load_run_config(run: Path) -> TrainConfig:
     the settings of that, of which whatever acts with the policy needs none.
 
     Raises:
-      UserError: the file is missing or damaged, the run's copy of its robot was edited, or its task
-        is code that was not imported.
+      UserError: the file is missing, damaged or of another version, the run's copy of its robot was
+        edited, or its task is code that was not imported.
     """
     path = run / CONFIG_FILE
     values = {"task": DEFAULT} | read_config_file(path)
@@ -261,15 +262,15 @@ def load_run_config(run: Path) -> TrainConfig:
             f"{now.path if now else its_task.__module__} differs from the task that {run} was "
             f"trained with, {code_of(run, 'task')}"
         )
-    # Here, as an error names this file.
-    env = validate(its_task.Config, values.get("env", {}), str(path), "env")
+    env = _validate_stored(its_task.Config, values.get("env", {}), path, "env")
     values = values | {"env": env}
     algorithm = own_algorithm(values.get("algorithm", PPO_NAME))
     if algorithm is not None and is_code_of(algorithm, run, "algorithm"):
-        values |= {"ppo": validate(algorithm.Config, values.get("ppo", {}), str(path), "ppo")}
+        ppo = _validate_stored(algorithm.Config, values.get("ppo", {}), path, "ppo")
+        values |= {"ppo": ppo}
     else:
         values = without_own_settings(values)
-    config = validate(TrainConfig, values, str(path))
+    config = _validate_stored(TrainConfig, values, path)
     config.set_sources(sources)
     if config.env.mjcf is not None and not is_packaged(config.env.mjcf):
         try:
@@ -280,6 +281,22 @@ def load_run_config(run: Path) -> TrainConfig:
                 f"{run / ROBOT} is not the robot of the training ({reason}); restore that folder"
             ) from error
     return config
+
+
+def _validate_stored(
+    kind: type[ConfigT], values: dict[str, Any], path: Path, group: str = ""
+) -> ConfigT:
+    """`validate` of what a training wrote, in which an unknown key is no slip of the user's."""
+    try:
+        return validate(kind, values, str(path), group)
+    except UserError as error:
+        key = unknown_key(error, group)
+        if key is None:
+            raise
+        raise UserError(
+            f"{path} has the setting {key}, which is unknown here, as another version of the "
+            "package or of the task wrote it; train again"
+        ) from error
 
 
 def without_own_settings(stored: dict[str, Any]) -> dict[str, Any]:

@@ -59,8 +59,14 @@ from bounce_mjx.resources import (
     policy_path,
     resource_path,
 )
-from bounce_mjx.runs import earlier
-from bounce_mjx.runs.config import CONFIG_FILE, ROBOT, TrainConfig, dump_sources, runs_folder
+from bounce_mjx.runs.config import (
+    CONFIG_FILE,
+    ROBOT,
+    TrainConfig,
+    dump_sources,
+    load_run_config,
+    runs_folder,
+)
 from bounce_mjx.runs.presets import BASE
 from bounce_mjx.runs.progress import load_results
 from bounce_mjx.runs.records import Checkpoint, DamagedCheckpoint, Record, verify
@@ -296,8 +302,7 @@ def best_checkpoint(
         record = records[checkpoint]
         # One without an evaluation is below any.
         score = record.report.score if record and record.report else ()
-        # Version 0.1.0 wrote no evaluation of a policy that it shipped.
-        return score, checkpoint.folder.parent.name == earlier.BEST, checkpoint.number
+        return score, checkpoint.number
 
     return max(records, key=quality)
 
@@ -384,8 +389,18 @@ def choose_checkpoint(
     if run != path:
         results = load_results(_best_seed(run))
         known = results.best.summary if results else "not evaluated"
-        tell(f"using the newest run: {run} ({known})")
+        tell(f"using the newest run: {run}{_arm_of(run)} ({known})")
     return find_checkpoint(run)
+
+
+def _arm_of(run: Path) -> str:
+    """The arm of a run in words, as a folder has the runs of all arms; empty for the project's own,
+    and for a run whose config cannot be read."""
+    try:
+        mjcf = load_run_config(run).env.mjcf
+    except UserError:
+        return ""
+    return "" if mjcf is None else f" of the arm in {mjcf.parent.name}/{mjcf.name}"
 
 
 def _policy_of_folder(log_dir: Path) -> str | None:
@@ -406,8 +421,6 @@ def stored_checkpoints(run: Path) -> list[Checkpoint]:
     with contextlib.suppress(OSError), os.scandir(folder) as entries:
         # One look, as a training may remove them meanwhile.
         paths = [folder / entry.name for entry in entries if entry.name.isdecimal()]
-    if not paths:
-        paths = earlier.checkpoints_in(folder)
     return [Checkpoint(run, path, int(path.name)) for path in paths if path.is_dir()]
 
 
@@ -418,7 +431,8 @@ def _checkpoints_in(run: Path, place: Path) -> list[Checkpoint]:
     inside = [checkpoint for checkpoint in stored if checkpoint.folder.is_relative_to(place)]
     if not stored:
         raise UserError(
-            f"{run} has no checkpoint, as its training ended before the first one; start again"
+            f"{run} has no checkpoint, as its training ended before the first one or another "
+            "version wrote it; start again"
         )
     if not inside:
         raise UserError(f"{place} holds no checkpoint of its run; give {run}, or one of its own")

@@ -12,7 +12,6 @@ from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.lazy import jax
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.config import is_packaged
-from bounce_mjx.runs.earlier import present_settings
 
 BASE = "base"
 """Key of a config file with the name of the preset on which it lies, or null for none."""
@@ -127,7 +126,7 @@ def read_config_file(
     Raises:
       UserError: the file is missing, is no mapping, or names a task or an algorithm by no text.
     """
-    values = present_settings(read_mapping(path, kind, example))
+    values = read_mapping(path, kind, example)
     for key in {"task", "algorithm"} & values.keys():
         if not isinstance(values[key], str):
             raise UserError(f"{shown_file(path)}: {key} is {values[key]}, but must be a name")

@@ -34,8 +34,8 @@ class Progress(pydantic.BaseModel):
     """Steps at the first evaluation that met all with a margin
     (`Report.passed_with_margin`)."""
     evaluations: list[dict[str, Any]] = []
-    """Of each, the value of each result by its name, its `steps`, whether it `passed`, and whether
-    the policy failed the `screening`, so that no full evaluation followed."""
+    """Of each, the value of each result by its name, its `steps`, whether a full evaluation
+    `passed`, and whether it ended with the `screening`, as the policy could not be the best."""
 
     def copy_so_far(self) -> "Progress":
         """A copy to which no later evaluation is added."""
@@ -50,6 +50,12 @@ class Progress(pydantic.BaseModel):
         # wait would be over before the first step.
         met = [e["steps"] for e in self.evaluations if e["passed"] and e["steps"] > 0]
         return bool(met) and self.evaluations[-1]["steps"] >= PATIENCE * met[0]
+
+    def may_be_best(self, report: Report) -> bool:
+        """Whether the policy of a report of a few episodes may be the best one: it meets all
+        results and, once a trained policy has met them, with a larger margin than the best one."""
+        has_met = self.best is not None and self.best.passed and self.best_steps > 0
+        return report.passed and (not has_met or report.margin > self.best.margin)
 
     def results(self, **run: Any) -> dict[str, Any]:
         """Content of results.json, after an evaluation.
@@ -70,12 +76,13 @@ class Progress(pydantic.BaseModel):
           seconds: see `solved_seconds`.
         """
         values = {result.name: result.value for result in report.results}
-        about = {"steps": steps, "passed": report.passed, "screening": report.screening}
+        passed = report.passed and not report.screening
+        about = {"steps": steps, "passed": passed, "screening": report.screening}
         self.evaluations.append(about | values)
-        if report.passed and self.solved_steps is None:
+        if passed and self.solved_steps is None:
             self.solved_steps = steps
             self.solved_seconds = seconds
-        if report.passed_with_margin and self.margin_steps is None:
+        if passed and report.passed_with_margin and self.margin_steps is None:
             self.margin_steps = steps
         if self.best is not None and report.score < self.best.score:
             return False

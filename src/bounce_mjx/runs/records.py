@@ -3,7 +3,6 @@
 A `UserError` refuses a checkpoint of which a file is damaged.
 """
 
-import json
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,7 +10,6 @@ import pydantic
 
 from bounce_mjx.errors import UserError, reason_of, shorten, warn_once
 from bounce_mjx.evaluation.results import Report
-from bounce_mjx.runs import earlier
 from bounce_mjx.runs.storage import MANIFEST_FILE, check_integrity
 
 RECORD = "record"
@@ -36,11 +34,6 @@ class Checkpoint(NamedTuple):
             return _read_record(self).steps
         except (OSError, ValueError):
             return self.number
-
-    @property
-    def is_old(self) -> bool:
-        """Whether version 0.1.0 wrote it."""
-        return (self.folder / earlier.RECORD_FILE).is_file()
 
 
 class Record(pydantic.BaseModel):
@@ -77,7 +70,7 @@ def verify(checkpoint: Checkpoint) -> Record:
         if (folder / MANIFEST_FILE).exists():
             check_integrity(folder)
         else:
-            # An earlier version was killed before it wrote the manifest.
+            # A copy by another program may lack it.
             warn_once(f"{folder} has no {MANIFEST_FILE} to find damage by")
         return _read_record(checkpoint)
     # One of pydantic's is a ValueError.
@@ -87,7 +80,4 @@ def verify(checkpoint: Checkpoint) -> Record:
 
 def _read_record(checkpoint: Checkpoint) -> Record:
     """Raises OSError or ValueError if it is missing or damaged."""
-    if checkpoint.is_old:
-        record = json.loads((checkpoint.folder / earlier.RECORD_FILE).read_bytes())
-        return Record.model_validate(earlier.with_report(record))
     return Record.model_validate_json((checkpoint.folder / RECORD / "metadata").read_bytes())

@@ -255,6 +255,7 @@ class Bounce(task.Task):
             last_action=step.last_action,
             joint_velocity=truth.joint_velocities,
             reward=config.reward,
+            goal=step.goal,
         )
         apex_offset = state.apex - target
         target_point = jnp.stack([ball[0], ball[1], target])

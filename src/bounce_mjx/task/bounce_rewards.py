@@ -17,7 +17,7 @@ from pydantic import Field
 
 from bounce_mjx.config import settings
 from bounce_mjx.lazy import jax, jnp
-from bounce_mjx.task import RewardTerm, gaussian, horizontal_distance, safe_sqrt
+from bounce_mjx.task import RewardTerm, Values, gaussian, horizontal_distance, safe_sqrt
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,6 +44,8 @@ class RewardInputs:
     """Arm joint velocities [n], rad/s."""
     reward: Rewards
     """Settings of all terms: the target point, the paddle's home height and gravity."""
+    goal: Values = dataclasses.field(default_factory=dict)
+    """Value [] of each goal, also of a task that extends bouncing by one."""
 
     @functools.cached_property
     def err_xy(self) -> jax.Array:

@@ -67,6 +67,17 @@ class TaskStep(NamedTuple):
     metrics: Values
     """Further numbers [] of the step."""
 
+    def plus(self, reward: Values | None = None, metrics: Values | None = None) -> TaskStep:
+        """The step with more weighted terms and metrics, for a task that extends another one.
+
+        Raises:
+          UserError: a name is taken.
+        """
+        return self._replace(
+            reward=_joined("term of the reward", self.reward, reward or {}),
+            metrics=_joined("metric", self.metrics, metrics or {}),
+        )
+
 
 class Moment(NamedTuple):
     """A control step of an episode that is measured."""
@@ -92,6 +103,24 @@ class Tally(NamedTuple):
     """Numbers that are summed over the steps of an episode."""
     maxima: Values = {}
     """Numbers of which the greatest over the steps of an episode counts; at least 0."""
+
+    def plus(self, sums: Values | None = None, maxima: Values | None = None) -> Tally:
+        """The tally with more numbers, for a task that extends another one.
+
+        Raises:
+          UserError: a name is taken.
+        """
+        return Tally(
+            sums=_joined("sum", self.sums, sums or {}),
+            maxima=_joined("maximum", self.maxima, maxima or {}),
+        )
+
+
+def _joined(kind: str, own: Values, more: Values) -> Values:
+    """Two mappings as one, of which no name hides another."""
+    if taken := sorted(own.keys() & more.keys()):
+        raise UserError(f"the task has the {kind} {taken[0]} already; choose another name")
+    return own | more
 
 
 class Marker(NamedTuple):

@@ -14,15 +14,19 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from bounce_mjx.env.env import Env
 from bounce_mjx.evaluation.episodes import run_episodes
 from bounce_mjx.evaluation.results import Report, judge
-from bounce_mjx.evaluation.statistics import RECORDED_EPISODES
+from bounce_mjx.evaluation.statistics import RECORDED_EPISODES, Measured
 from bounce_mjx.learning.policy import Policy, make_networks
 from bounce_mjx.runs.checkpoints import policy_shapes
 from bounce_mjx.runs.config import TrainConfig
+from bounce_mjx.runs.progress import Progress
 from bounce_mjx.training import hosts
 from bounce_mjx.training.ppo_trainer import each_seed
 from bounce_mjx.training.setup import compiler_options
 
 Tree = TypeVar("Tree")
+Chunk = Measured
+"""Statistics and recording of some episodes of an evaluation, with several seeds of each [S, ...],
+the episodes last."""
 
 # Added to the seed of the selecting evaluations to get the seed of the final one, which no config
 # can contain.
@@ -36,8 +40,9 @@ class Evaluators:
     the selected policy are then measured once more on fresh resets, because the best of many
     evaluations on the same resets is biased upwards.
 
-    With a screening, the program runs as many episodes as the screening has, and a full evaluation
-    runs it several times: it is then the only evaluation to be compiled.
+    With a screening, an evaluation begins with as many episodes as the screening has, and doubles
+    them as long as a policy may be the best of its seed. The program runs those of the screening,
+    and a full evaluation runs it several times: it is then the only evaluation to be compiled.
     """
 
     def __init__(
@@ -61,23 +66,35 @@ class Evaluators:
         """Waits until the program is compiled."""
         self._program.result()
 
-    def select(self, policies: Sequence[Policy]) -> list[Report]:
-        """A report of each policy; if no policy passes the screening, the reports of the
-        screening."""
-        if self._config.screening_episodes:
-            screened = self._measure(policies, self._config.eval_seed, screening=True)
-            if not any(report.passed for report in screened):
-                return [dataclasses.replace(report, screening=True) for report in screened]
-        return self._measure(policies, self._config.eval_seed)
+    def select(self, policies: Sequence[Policy], progresses: Sequence[Progress]) -> list[Report]:
+        """A report of each policy: of a full evaluation, or of its first episodes, as a
+        `Report.screening`, where these say that no policy may be the best of its seed.
+
+        Args:
+          progresses: what each seed has reached so far.
+        """
+        full = self._config.eval_episodes
+        chunks: list[Chunk] = []
+        episodes = self._chunk
+        while True:
+            chunks += self._run(policies, self._config.eval_seed, len(chunks), episodes)
+            reports = self._judge(chunks, episodes)
+            if episodes == full:
+                return reports
+            pairs = zip(progresses, reports, strict=True)
+            if not any(progress.may_be_best(report) for progress, report in pairs):
+                return [dataclasses.replace(report, screening=True) for report in reports]
+            episodes = min(2 * episodes, full)
 
     def final(self, policies: Sequence[Policy]) -> list[Report]:
         """A full report of each policy, on resets that no selection has seen."""
-        return self._measure(policies, self._config.eval_seed + _FINAL)
+        seed = self._config.eval_seed + _FINAL
+        episodes = self._config.eval_episodes
+        return self._judge(self._run(policies, seed, 0, episodes), episodes)
 
     def _lower(self) -> jax.stages.Lowered:
         """The program (policy, seed, index of the first episode) -> statistics and recording of a
-        chunk of episodes. They are numbered, first those of a full evaluation, then those of a
-        screening."""
+        chunk of episodes."""
         config = self._config
         env = self._env
         networks = make_networks(config.ppo, env.observation_size, env.action_size)
@@ -94,13 +111,7 @@ class Evaluators:
         def evaluate(policy: Policy, seed: jax.Array, first: jax.Array):
             # Keys are made inside the program: outside it, each operation would take a tenth of a
             # second. The last chunk may reach beyond the last episode.
-            full, screening = jax.random.split(jax.random.PRNGKey(seed))
-            keys = jnp.concatenate(
-                [
-                    jax.random.split(full, config.eval_episodes),
-                    jax.random.split(screening, config.screening_episodes),
-                ]
-            )
+            keys = jax.random.split(jax.random.PRNGKey(seed), config.eval_episodes)
             return run_all(policy, jnp.take(keys, first + jnp.arange(self._chunk), 0, mode="clip"))
 
         program = jax.jit(
@@ -115,36 +126,37 @@ class Evaluators:
         )
         return program.lower(shapes, np.uint32(0), np.int32(0))
 
-    def _measure(
-        self, policies: Sequence[Policy], seed: int, screening: bool = False
-    ) -> list[Report]:
-        config = self._config
+    def _run(self, policies: Sequence[Policy], seed: int, first: int, episodes: int) -> list[Chunk]:
+        """Simulates the chunks of an evaluation that are still missing.
+
+        Args:
+          first: number of chunks that are there.
+          episodes: number of episodes that all chunks together have at least.
+        """
         program = self._program.result()
-        first = config.eval_episodes if screening else 0
-        episodes = config.screening_episodes if screening else config.eval_episodes
-        several = config.num_seeds > 1
         policy = policies[0]
-        if several:
+        if self._config.num_seeds > 1:
             policy = jax.tree.map(lambda *leaves: np.stack(leaves), *policies)
         on_devices = hosts.distribute(policy, jax.tree.map(lambda _: self._sharding, policy))
 
-        def evaluate(start: int):
-            chunk = program(on_devices, np.uint32(seed), np.int32(first + start))
+        def evaluate(start: int) -> Chunk:
+            chunk = program(on_devices, np.uint32(seed), np.int32(start))
             # Otherwise one thread would start all of them at once.
             return jax.block_until_ready(chunk)
 
         with concurrent.futures.ThreadPoolExecutor(self._threads) as pool:
-            chunks = pool.map(evaluate, range(0, episodes, self._chunk))
-            parts, recordings = zip(*chunks, strict=True)
-        statistics = _joined(parts, episodes)
+            return list(pool.map(evaluate, range(first * self._chunk, episodes, self._chunk)))
+
+    def _judge(self, chunks: Sequence[Chunk], episodes: int) -> list[Report]:
+        """A report of each policy from the first episodes of an evaluation."""
+        seeds = self._config.num_seeds
+        parts, recordings = zip(*chunks, strict=True)
         recording = None
-        if not several:
+        if seeds == 1:
             recorded = min(RECORDED_EPISODES, episodes)
             recording = _joined(recordings[: -(-recorded // self._chunk)], recorded)
-        return [
-            judge(self._env, of_seed, recording)
-            for of_seed in each_seed(statistics, config.num_seeds)
-        ]
+        statistics = _joined(parts, episodes)
+        return [judge(self._env, each, recording) for each in each_seed(statistics, seeds)]
 
 
 def _joined(chunks: Sequence[Tree], episodes: int) -> Tree:

@@ -351,7 +351,8 @@ class Job:
         """Evaluates the current policies, unless the training is stopping."""
         is_first = "evaluate" not in self.clock.seconds
         policies = self.take_snapshot().policies
-        reports = self.wait_for_reports(self.evaluators.select, policies)
+        progresses = [seed.progress for seed in self.seeds]
+        reports = self.wait_for_reports(self.evaluators.select, policies, progresses)
         if reports is None:
             return
         seconds = sum(self.clock.seconds.values())
@@ -629,15 +630,20 @@ class Job:
         return future.result()
 
     def wait_for_reports(
-        self, evaluate: Callable[[list[Policy]], list[Report]], policies: list[Policy]
+        self, evaluate: Callable[..., list[Report]], *given: Any
     ) -> list[Report] | None:
-        """A report of each seed, or None if a signal has come or comes meanwhile, or a callback has
-        failed."""
+        """What an evaluation reports of each seed, or None if a signal has come or comes meanwhile,
+        or a callback has failed.
+
+        Args:
+          evaluate: the evaluation.
+          given: its arguments.
+        """
         # On several hosts, a process that stopped on its own would keep the others waiting.
         may_leave = jax.process_count() == 1
         if may_leave and (self.stop.requested or self.failure is not None):
             return None
-        evaluating = self.pool.submit(evaluate, policies)
+        evaluating = self.pool.submit(evaluate, *given)
         if not self.stop.wait_for(evaluating) and may_leave:
             return None
         reports = evaluating.result()

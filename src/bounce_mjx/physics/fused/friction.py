@@ -7,7 +7,7 @@ from bounce_mjx.physics.fused import chain
 from bounce_mjx.physics.fused.ball import Ball
 from bounce_mjx.physics.fused.contact import Contact
 from bounce_mjx.physics.fused.model import BallModel, FusedModel
-from bounce_mjx.physics.scalars import Scalar, Vec, add, cross, dot, mul
+from bounce_mjx.physics.scalars import Scalar, Vec, add, cross, dot, mul, not_inlined
 
 
 def rub(
@@ -65,16 +65,17 @@ def _rub_on_paddle(
     lever = contact.normal * -ball_model.radius
     per_joint = list(chain.point_velocities(model.links, pose, centre + lever))
     of_paddle = Vec(dot([velocity[i] for velocity in per_joint], v) for i in range(3))
-    slip = _tangential(_surface_velocity(ball, lever) - of_paddle, contact)
+    # All results need what is kept here (`not_inlined`).
+    slip = not_inlined(_tangential(_surface_velocity(ball, lever) - of_paddle, contact))
     # The paddle's velocity counts against the ball's.
     generalised = [-(slip @ velocity) for velocity in per_joint]
-    half_generalised = chain.solve_lower(mass_factor, generalised)
+    half_generalised = not_inlined(chain.solve_lower(mass_factor, generalised))
     squared_slip = slip @ slip
     compliance = add(
         mul(squared_slip, _surface_compliance(ball_model)),
         dot(half_generalised, half_generalised),
     )
-    scale = impulse_per_slip(squared_slip, compliance, largest)
+    scale = not_inlined(impulse_per_slip(squared_slip, compliance, largest))
     v = v - Vec(chain.solve_upper(mass_factor, half_generalised)) * scale
     return v, _after_impulse(ball_model, ball, lever, slip * -scale)
 
