@@ -160,7 +160,7 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
 @pytest.fixture(autouse=True)
 def _no_code_of_another_test(monkeypatch: pytest.MonkeyPatch) -> None:
     """In a process of a user's, two files may not have classes of one name."""
-    monkeypatch.setattr(user_code, "_sources", {})
+    monkeypatch.setattr(user_code, "_code_files", {})
     monkeypatch.setattr(user_code, "_command", [])
 
 

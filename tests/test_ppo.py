@@ -576,7 +576,7 @@ def test_settings_of_an_own_algorithm_are_keys(tmp_path):
     policy = jax.tree.map(lambda x: np.ones(x.shape, x.dtype), policy_shapes(config))
     run = write_run(config, 64, policy)
     assert load_run_config(run).ppo.own_cost == 2.0
-    user_code._sources.clear()
+    user_code._code_files.clear()
     without = load_run_config(run)
     assert not hasattr(without.ppo, "own_cost")
     jax.tree.map(

@@ -397,14 +397,14 @@ def test_a_run_of_another_algorithm_is_refused_as_such(folder: Path, refused) ->
     own = read_layers(Choice(algorithm="own")).config({"log_dir": folder / "runs"})
     run = create_run(own)
     refused(f"train {run} --algorithm ppo", "has its algorithm, with which it is resumed")
-    user_code._sources.clear()
+    user_code._code_files.clear()
     code = run / "algorithm/own.py"
     refused(f"train {run}", f"whose code is {code}; import it to run it: bounce-mjx train {run}")
     refused(
         f"train {run} --import other.py", "cannot be resumed with another algorithm than it was"
     )
     # Whatever acts with the policy needs none of it.
-    user_code._sources.clear()
+    user_code._code_files.clear()
     assert load_run_config(run).ppo.num_envs == own.ppo.num_envs
 
 

@@ -854,7 +854,7 @@ def test_a_command_without_its_import_prints_the_whole_command(
     (run_folder / "checkpoints/1").mkdir(parents=True)
     copy = run_folder / "task" / "mine.py"
     for line in (f"eval {run_folder}", f"play {run_folder}", f"train {run_folder} --seed 3"):
-        user_code._sources.clear()
+        user_code._code_files.clear()
         refused(line, f"import it to run it: bounce-mjx {line} --import {copy}")
 
 
@@ -873,7 +873,7 @@ def test_a_checkpoint_is_read_without_the_original_files(mine: Path, tmp_path: P
     marker = tmp_path / "ran"
     mine.write_text(f"open({str(marker)!r}, 'w')\n")
     moved = run_folder.rename(tmp_path / "moved")
-    user_code._sources.clear()
+    user_code._code_files.clear()
     import_code(moved / "task/mine.py")
     checkpoints.read_policy(find_checkpoint(moved), load_run_config(moved))
     assert not marker.exists()
@@ -907,7 +907,7 @@ def test_another_file_than_the_runs_is_told(
     assert read_command([str(run_folder)]).config.env == config.env
     changed = tmp_path / "changed.py"
     changed.write_text(mine.read_text().replace("weight: float = 4.0", "weight: float = 5.0"))
-    user_code._sources.clear()
+    user_code._code_files.clear()
     import_code(changed)
     with pytest.raises(UserError, match=r"cannot be resumed with another task than it was trained"):
         read_command([str(run_folder)])

@@ -30,7 +30,7 @@ _PACKAGE = "bounce_mjx."
 _PREFIX = "bounce_mjx_file_"
 
 
-class Source(NamedTuple):
+class CodeFile(NamedTuple):
     """A file of code."""
 
     path: Path
@@ -39,7 +39,7 @@ class Source(NamedTuple):
 
 
 # Of the imported files, by the name of their module.
-_sources: dict[str, Source] = {}
+_code_files: dict[str, CodeFile] = {}
 _numbers = itertools.count()
 # The words of the command that runs here, for the command that has an import in addition.
 _command: list[str] = []
@@ -65,8 +65,8 @@ def import_code(place: str | os.PathLike) -> None:
         raise UserError(
             f"{shorten(str(path))} cannot be read ({reason_of(error)}); give {_FLAG} FILE.py"
         ) from error
-    if all(content != source.content for source in _sources.values()):
-        _run(Source(path, content))
+    if all(content != code_file.content for code_file in _code_files.values()):
+        _run(CodeFile(path, content))
 
 
 def run_imports(command: Sequence[str]) -> list[str]:
@@ -104,7 +104,7 @@ def class_of(name: str, base: type[Kind]) -> type[Kind] | None:
         return None
     newest = found[-1]
     for other in found:
-        if not _is_same(source_of(other), source_of(newest)):
+        if not _is_same(code_file_of(other), code_file_of(newest)):
             places = f"{_place_of(other)} and {_place_of(newest)}"
             raise UserError(f"{name} is a class of {places}; import one of them, or rename one")
     return newest
@@ -120,13 +120,13 @@ def own_name(kind: type) -> str:
     return kind.__name__.lower()
 
 
-def source_of(kind: type) -> Source | None:
+def code_file_of(kind: type) -> CodeFile | None:
     """The file of a class; None for one of a notebook or an interpreter."""
-    if kind.__module__ in _sources:
-        return _sources[kind.__module__]
+    if kind.__module__ in _code_files:
+        return _code_files[kind.__module__]
     try:
         path = Path(os.path.abspath(inspect.getsourcefile(kind) or ""))
-        return Source(path, path.read_bytes())
+        return CodeFile(path, path.read_bytes())
     except (TypeError, OSError):
         return None
 
@@ -136,9 +136,9 @@ def import_flags(*kinds: type) -> list[str]:
     package, and of no file."""
     flags = []
     for kind in kinds:
-        source = None if kind.__module__.startswith(_PACKAGE) else source_of(kind)
-        if source is not None and str(source.path) not in flags:
-            flags += [_FLAG, str(source.path)]
+        code_file = None if kind.__module__.startswith(_PACKAGE) else code_file_of(kind)
+        if code_file is not None and str(code_file.path) not in flags:
+            flags += [_FLAG, str(code_file.path)]
     return flags
 
 
@@ -171,27 +171,27 @@ def _import_module(name: str) -> None:
         ) from error
 
 
-def _run(source: Source) -> None:
+def _run(code_file: CodeFile) -> None:
     """Runs a file as a module.
 
     Raises:
       UserError: it raises an error.
     """
-    module = types.ModuleType(f"{_PREFIX}{source.path.stem}_{next(_numbers)}")
-    module.__file__ = str(source.path)
+    module = types.ModuleType(f"{_PREFIX}{code_file.path.stem}_{next(_numbers)}")
+    module.__file__ = str(code_file.path)
     # Dataclasses and pickles look for their module there.
     sys.modules[module.__name__] = module
-    _sources[module.__name__] = source
+    _code_files[module.__name__] = code_file
     try:
-        exec(compile(source.content, str(source.path), "exec"), vars(module))
+        exec(compile(code_file.content, str(code_file.path), "exec"), vars(module))
     except UserError as error:
-        del _sources[module.__name__]
-        raise UserError(f"{source.path} cannot be imported: {error}") from error
+        del _code_files[module.__name__]
+        raise UserError(f"{code_file.path} cannot be imported: {error}") from error
     except Exception as error:
-        del _sources[module.__name__]
+        del _code_files[module.__name__]
         line = 1
         for frame in traceback.extract_tb(error.__traceback__):
-            if frame.filename == str(source.path):
+            if frame.filename == str(code_file.path):
                 line = frame.lineno
         # A SyntaxError has its own.
         line = getattr(error, "lineno", None) or line
@@ -199,7 +199,7 @@ def _run(source: Source) -> None:
         if isinstance(error, pydantic.ValidationError):
             reason = describe(error, {})
         raise UserError(
-            f"{source.path} cannot be imported ({type(error).__name__} in line {line}: "
+            f"{code_file.path} cannot be imported ({type(error).__name__} in line {line}: "
             f"{shorten(reason, 300)}); correct it"
         ) from error
 
@@ -209,20 +209,20 @@ def _subclasses(base: type[Kind]) -> Iterator[type[Kind]]:
     module has defined anew since, nor one within a function."""
     for kind in base.__subclasses__():
         module = sys.modules.get(kind.__module__)
-        is_forgotten = kind.__module__.startswith(_PREFIX) and kind.__module__ not in _sources
+        is_forgotten = kind.__module__.startswith(_PREFIX) and kind.__module__ not in _code_files
         is_own = not kind.__module__.startswith(_PACKAGE) and not is_forgotten
         if is_own and getattr(module, kind.__qualname__, None) is kind:
             yield kind
         yield from _subclasses(kind)
 
 
-def _is_same(one: Source | None, other: Source | None) -> bool:
-    """Whether two sources are one file, or its copy."""
+def _is_same(one: CodeFile | None, other: CodeFile | None) -> bool:
+    """Whether two files of code are one, or its copy."""
     if one is None or other is None:
         return one is other
     return one.path == other.path or one.content == other.content
 
 
 def _place_of(kind: type) -> str:
-    source = source_of(kind)
-    return kind.__module__ if source is None else str(source.path)
+    code_file = code_file_of(kind)
+    return kind.__module__ if code_file is None else str(code_file.path)

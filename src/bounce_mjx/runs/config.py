@@ -9,7 +9,7 @@ from pydantic import Field
 from pydantic.fields import FieldInfo
 
 from bounce_mjx.config.settings import Count, NonNegativeInt, Steps, StrictModel, fields_in
-from bounce_mjx.config.user_code import not_imported, source_of
+from bounce_mjx.config.user_code import code_file_of, not_imported
 from bounce_mjx.config.validation import ConfigT, unknown_key, validate
 from bounce_mjx.errors import UserError, warn_once
 from bounce_mjx.evaluation.config import DEFAULT_SEED
@@ -257,9 +257,9 @@ def load_run_config(run: Path) -> TrainConfig:
     sources = _sources_in(values.pop(SOURCES, None))
     its_task = task_in(f"the run {run}", values["task"], code_of(run, "task"))
     if not is_code_of(its_task, run, "task"):
-        place = source_of(its_task)
+        now = code_file_of(its_task)
         warn_once(
-            f"{place.path if place else its_task.__module__} differs from the task that {run} was "
+            f"{now.path if now else its_task.__module__} differs from the task that {run} was "
             f"trained with, {code_of(run, 'task')}"
         )
     env = _validate_stored(its_task.Config, values.get("env", {}), path, "env")
@@ -343,8 +343,8 @@ def code_of(run: Path, key: str) -> Path | None:
 def is_code_of(kind: type, run: Path, key: str) -> bool:
     """Whether a task or an algorithm is the one that a run has a copy of, or that of a package."""
     copy = code_of(run, key)
-    source = source_of(kind)
-    return copy is None or source is None or copy.read_bytes() == source.content
+    now = code_file_of(kind)
+    return copy is None or now is None or copy.read_bytes() == now.content
 
 
 def task_in(source: str, name: str, code: Path | None = None) -> type[Task]:

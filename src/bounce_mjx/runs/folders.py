@@ -46,7 +46,7 @@ from pathlib import Path
 from typing import Any
 
 from bounce_mjx.config.files import dump_config
-from bounce_mjx.config.user_code import source_of
+from bounce_mjx.config.user_code import code_file_of
 from bounce_mjx.errors import UserError, suggest, warn_once
 from bounce_mjx.lazy import mujoco
 from bounce_mjx.learning.registry import own_algorithm
@@ -119,10 +119,10 @@ def save_config(run: Path, config: TrainConfig) -> None:
     algorithm, unless the run has them."""
     own = {"task": own_task(config.task), "algorithm": own_algorithm(config.algorithm)}
     for key, kind in own.items():
-        source = None if kind is None else source_of(kind)
-        if source is not None and not (run / key).exists():
+        code = None if kind is None else code_file_of(kind)
+        if code is not None and not (run / key).exists():
             (run / key).mkdir()
-            write_atomically(run / key / source.path.name, source.content)
+            write_atomically(run / key / code.path.name, code.content)
     if (mjcf := config.env.mjcf) is not None:
         # As a config's own path is absolute and without .. in it.
         here = Path(os.path.abspath(run))
