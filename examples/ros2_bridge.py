@@ -15,7 +15,7 @@ ur_rtde_bridge.py), also tells whether it is the policy's arm. A pose of TF does
 /joint_states and a file.
 
 Publish a message on /start for each episode, also after a fault; if the arm was moved with its
-servos off, start the program again. Read "Safety steps" in docs/real-robot.md first.
+servos off, start the program again. Read "Safety" in docs/your-arm.md first.
 """
 
 import argparse

@@ -111,8 +111,8 @@ class Arm:
                 return
         raise AssertionError(f"always {state}")
 
-    def check(self) -> None:
-        velocity = np.diff(self.rows, axis=0) * 1e3
+    def check(self, since: int = 0) -> None:
+        velocity = np.diff(self.rows[since:], axis=0) * 1e3
         acceleration = np.diff(velocity, axis=0) * 1e3
         jerk = np.diff(acceleration, axis=0) * 1e3
         for values, limit in ((velocity, 2.0), (acceleration, 15.0), (jerk, 7500.0)):
@@ -294,7 +294,8 @@ def test_the_commands_of_a_control_step_are_given_once(late: float) -> None:
     assert call > 20 and arm.supervisor.fault == "time"
     assert "the time has stood at" in arm.supervisor.reason
     arm.until("stopped")
-    arm.check()
+    # The robot came to the end of its commands meanwhile.
+    assert np.ptp(arm.rows[rows - 1 :], axis=0).max() < 1e-9
 
 
 def test_a_late_step_goes_on_from_rest_within_the_limits() -> None:
@@ -310,6 +311,197 @@ def test_a_late_step_goes_on_from_rest_within_the_limits() -> None:
             assert np.abs(first).max() <= 0.5 * 15.0 * 1e-6 + 1e-9
             steps = np.diff(np.vstack([start, start, arm.rows[-10:]]), axis=0)
             assert np.abs(np.diff(steps, axis=0)).max() <= 15.0 * 1e-6 * (1.0 + 1e-5)
+
+
+class Host:
+    """The monotonic clock of the computer beside the robot."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch):
+        self.now = 50.0
+        monkeypatch.setattr("bounce_mjx.deploy.supervisor.time.monotonic", lambda: self.now)
+
+
+def played_on(host: Host, steps: int = 75) -> Arm:
+    """An arm in play, whose clock agrees with the host's."""
+    arm = Arm(limited().supervise(1000))
+    for _ in range(10):
+        arm.step()
+        host.now += 0.01
+    arm.supervisor.start()
+    for i in range(steps):
+        assert arm.step(**flying(i)) == "running", arm.supervisor.reason
+        host.now += 0.01
+    return arm
+
+
+JUMPS = {
+    "once forward": (5.0, 1),
+    "once back": (-5.0, 1),
+    "forward": (5.0, None),
+    "by two steps": (0.02, None),
+    "a restarted clock": (-0.6, None),
+}
+
+
+@pytest.mark.parametrize("jump, samples", JUMPS.values(), ids=JUMPS)
+def test_a_time_that_the_hosts_clock_contradicts_moves_nothing_beyond_the_limits(
+    jump: float, samples: int | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The robot has not waited, and goes on; a clock that stays elsewhere brakes it."""
+    host = Host(monkeypatch)
+    arm = played_on(host)
+    assert np.abs(arm.velocities).max() > 0.05
+    arm.time += jump
+    for i in range(75, 140):
+        arm.step(**flying(i))
+        host.now += 0.01
+        if i == 75 and samples:
+            arm.time -= jump
+    arm.check()
+    if samples:
+        assert arm.supervisor.state == "running"
+        return
+    assert (arm.supervisor.state, arm.supervisor.fault) == ("stopped", "time")
+    assert "by this computer's clock" in arm.supervisor.reason
+    # A restart begins a new clock.
+    arm.supervisor.restart()
+    for _ in range(20):
+        arm.step()
+        host.now += 0.01
+    assert arm.supervisor.state in ("homing", "ready"), arm.supervisor.reason
+
+
+@pytest.mark.parametrize("is_home", [False, True])
+def test_a_time_from_the_future_does_not_outlive_a_restart(is_home: bool) -> None:
+    """Also where no other clock has agreed with the driver's."""
+    arm = Arm(limited().supervise(1000)) if is_home else running()
+    arm.step()
+    arm.step(time=arm.time + 1e5)
+    arm.step()
+    assert arm.supervisor.fault in ("time", "late_step")
+    for _ in range(60):
+        arm.step()
+    assert arm.supervisor.state == "stopped"
+    arm.supervisor.restart()
+    for _ in range(200):
+        arm.step()
+    assert arm.supervisor.state == "ready", arm.supervisor.reason
+
+
+@pytest.mark.parametrize("kind", ["it stands", "it goes back"])
+@pytest.mark.parametrize("is_agreed", [False, True])
+def test_an_arm_that_waited_for_a_clock_goes_on_from_rest(
+    kind: str, is_agreed: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    host = Host(monkeypatch)
+    arm = played_on(host)
+    if not is_agreed:
+        host.now += 100.0
+        arm.step(**flying(75))
+    rows = len(arm.rows)
+    known = arm.time - 0.01
+    for _ in range(60):
+        arm.time = known if kind == "it stands" else known - 0.3
+        arm.step(**flying(76))
+        host.now += 0.01 if is_agreed else 1e-4
+    assert (arm.supervisor.state, arm.supervisor.fault) == ("stopped", "time")
+    if kind == "it goes back" and is_agreed:
+        # The host's clock went on, and so did the arm.
+        arm.check()
+    else:
+        assert np.ptp(arm.rows[rows - 1 :], axis=0).max() < 1e-9
+
+
+def test_a_late_step_is_told_by_the_hosts_clock(monkeypatch: pytest.MonkeyPatch) -> None:
+    host = Host(monkeypatch)
+    arm = played_on(host)
+    rows = len(arm.rows)
+    arm.time += 0.02
+    host.now += 0.02
+    start = arm.rows[-1]
+    assert arm.step(**flying(77)) == "running"
+    assert np.abs(arm.rows[rows] - start).max() <= 0.5 * 15.0 * 1e-6 + 1e-9
+
+
+@pytest.mark.parametrize("period", [0.00985, 0.0102])
+def test_a_loop_that_drifts_has_commands_in_every_step(period: float) -> None:
+    """As of a robot whose clock is 2% faster or slower than its program's; a phase that crosses
+    the middle of two steps is no late step."""
+    arm = Arm(limited().supervise(1000))
+    arm.until("ready")
+    arm.supervisor.start()
+    rows = len(arm.rows)
+    time = arm.time
+    for i in range(300):
+        given = ball_over(PADDLE, period * i)
+        assert arm.step(**given, time=time + period * i) == "running", arm.supervisor.reason
+    assert len(arm.rows) - rows == 300 * 10
+    arm.check()
+
+
+def test_one_shift_of_the_phase_is_no_late_step() -> None:
+    """The robot had commands until 4 ms ago."""
+    arm = running()
+    arm.time += 0.004
+    for i in range(25, 28):
+        assert arm.step(**flying(i)) == "running"
+    arm.time += 0.004
+    for i in range(28, 31):
+        assert arm.step(**flying(i)) == "running"
+    arm.check()
+
+
+def test_a_first_sample_of_an_episode_that_cannot_be_true_is_bridged() -> None:
+    arm = Arm(limited().supervise(1000))
+    arm.until("ready")
+    arm.supervisor.start()
+    assert arm.step(**flying(0), joint_angles=arm.angles + 0.9) == "running", arm.supervisor.reason
+
+
+def test_a_stop_holds_an_arm_that_is_outside_of_its_range() -> None:
+    policy = limited()
+    start = HOME.copy()
+    start[2] = policy.metadata.joint_ranges[2][1] + 0.3
+    policy.reset(start)
+    arm = Arm(policy.supervise(1000), start)
+    arm.step()
+    arm.supervisor.stop("the operator")
+    for _ in range(100):
+        arm.step()
+    assert arm.supervisor.state == "stopped"
+    arm.check()
+    # What the one control step had begun is braked.
+    assert np.abs(arm.angles - start).max() < 2e-3
+    rested = arm.angles
+    for _ in range(20):
+        arm.step()
+    np.testing.assert_array_equal(arm.angles, rested)
+    arm.supervisor.restart()
+    arm.until("ready")
+
+
+def test_an_arm_has_its_second_to_settle_after_its_targets_stand_still() -> None:
+    policy = limited()
+    arm = policy.supervise(1000)
+    for step in range(170):
+        moving = 0.2 + 1e-3 * step if step < 150 else 0.2
+        given = measured(HOME, joint_targets=HOME + moving, time=0.01 * step)
+        assert arm.commands(given).shape == (0, 6)
+        assert arm.state == "homing", arm.reason
+
+
+def test_a_time_in_a_list_is_a_time() -> None:
+    arm = running()
+    arm.supervisor.stop("the operator")
+    before = len(arm.rows)
+    for _ in range(3):
+        arm.step(time=[arm.time])
+    assert len(arm.rows) - before == 30
+    arm.time += 5.0
+    rows = len(arm.rows)
+    arm.step(time=[arm.time])
+    # The robot came to the end of its commands.
+    assert np.ptp(arm.rows[rows - 1 :], axis=0).max() < 1e-9
 
 
 def test_without_a_time_the_hosts_clock_counts(monkeypatch: pytest.MonkeyPatch) -> None:

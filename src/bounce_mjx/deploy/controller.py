@@ -72,9 +72,16 @@ class Controller:
         memory = self.act(memory, measured, steps)
         return memory, memory.action
 
-    def take(self, memory: Memory, measured: Measurements) -> tuple[Memory, Measurements, int]:
+    def take(
+        self, memory: Memory, measured: Measurements, waited: float | None = None
+    ) -> tuple[Memory, Measurements, int]:
         """The memory with a new sample; the sample, with the last values in place of those that
         cannot be true; and the control steps since the last one.
+
+        Args:
+          memory: before the sample.
+          measured: the sample.
+          waited: as for `clock.advance`.
 
         Raises:
           ImpossibleMeasurement: as `Samples.take`; or it comes a second or more after the last one.
@@ -89,7 +96,7 @@ class Controller:
                     f"reset after a pause of {PAUSE:g} s, and give seconds",
                 )
         rests_at = None if memory.course is None else self.motion.target(memory.course)
-        seen, measured, steps = self.samples.take(memory.seen, measured, rests_at)
+        seen, measured, steps = self.samples.take(memory.seen, measured, rests_at, waited)
         return memory._replace(seen=seen), measured, steps
 
     def act(self, memory: Memory, measured: Measurements, steps: int) -> Memory:
@@ -109,8 +116,7 @@ class Controller:
         angles = measured.get("joint_angles")
         if course is None and angles is not None:
             course = self.motion.resting(angles)
-        if steps > 1 and course is not None:
-            # The robot has come to the end of its commands, and waited for others.
+        if memory.seen.clock.has_waited and course is not None:
             course = self.motion.stopped(course)
         if course is not None and angles is not None and self.metadata.max_lead is not None:
             measured = measured | {"servo_lead": course.end.position - angles}

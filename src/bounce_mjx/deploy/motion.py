@@ -42,8 +42,15 @@ class Motion:
 
     def hold(self, last: Course) -> Course:
         """The control step after the last one, in which the commands brake within the limits, or
-        rest."""
-        return self.aim(last, last.end.position)
+        rest; also outside of the range, where the arm was found."""
+        start = last.end.position
+        limits = self._limits
+        if limits is None:
+            return Course(self._still_at(start), last.end)
+        low, high = self._range
+        around = (np.minimum(low, start), np.maximum(high, start))
+        limits = limits._replace(range=around)
+        return Course(next_setpoint(limits, last.end, start, self._duration, np), last.end)
 
     def move(self, last: Course, target: np.ndarray, speed: float) -> Course:
         """A control step in which the commands move toward joint angles [J] (rad), at most at a

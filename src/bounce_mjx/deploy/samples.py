@@ -155,7 +155,11 @@ class Samples:
         self._flight = flight_bounds(metadata)
 
     def take(
-        self, seen: Seen, measured: Measurements, rests_at: np.ndarray | None = None
+        self,
+        seen: Seen,
+        measured: Measurements,
+        rests_at: np.ndarray | None = None,
+        waited: float | None = None,
     ) -> tuple[Seen, Measurements, int]:
         """What is known with a new sample; the sample, with the last values in place of those that
         cannot be true; and the control steps since the last one.
@@ -165,12 +169,13 @@ class Samples:
           measured: arrays by name, as for `OnnxNetwork.step`, and `time` [1].
           rests_at: angles [J] (rad) at which the arm is known to rest, for a first sample; without,
             it is to be near the start pose.
+          waited: as for `clock.advance`.
 
         Raises:
           ImpossibleMeasurement: it cannot be true, and nor could too many before.
         """
         measured = dict(measured)
-        seen, steps, elapsed = self._take_time(seen, measured)
+        seen, steps, elapsed = self._take_time(seen, measured, waited)
         if "joint_angles" in measured:
             seen = self._take_arm(seen, measured, rests_at, elapsed)
         if "ball_position" in measured:
@@ -180,21 +185,44 @@ class Samples:
     def rest(self, seen: Seen, angles: np.ndarray) -> Seen:
         """What is known of an arm that rests at angles [J], rad; the ball is forgotten, the clock
         goes on."""
+        now = seen.clock.now
         values = {"joint_angles": angles, "joint_velocities": self._still}
-        return Seen(clock=seen.clock, values=values, arm_time=seen.clock.now)
+        paddle = ((now, paddle_position(self._metadata, angles)),)
+        return Seen(clock=seen.clock, values=values, arm_time=now, paddle=paddle)
 
-    def _take_time(self, seen: Seen, measured: Measurements) -> tuple[Seen, int, float]:
+    def bridge_time(self, seen: Seen, given: float, believed: float) -> Seen:
+        """What is known with one more time of the driver that another clock contradicts.
+
+        Args:
+          given: by the driver, s.
+          believed: in its place, s.
+
+        Raises:
+          ImpossibleMeasurement: too many of the last ones were such.
+        """
+        doubt = Doubt(
+            "time",
+            f"the time is {given:.10g} s, {given - believed:+.3g} s from what it has to be by this "
+            "computer's clock; give seconds of one clock, and call restart if it starts again",
+        )
+        last = believed if seen.clock.time is None else seen.clock.time
+        return self._bridge(seen, "time", doubt, max(believed - last, self._dt))
+
+    def _take_time(
+        self, seen: Seen, measured: Measurements, waited: float | None
+    ) -> tuple[Seen, int, float]:
         """Passes the time, which goes on: the steps and the time (s) since the last sample."""
         time = float(measured["time"][0]) if "time" in measured else None
-        clock, elapsed, steps = advance(seen.clock, time, self._dt)
+        clock, elapsed, steps = advance(seen.clock, time, self._dt, waited)
         if elapsed < -self._dt:
             reason = (
                 f"the time went back by {-elapsed:.3g} s; give seconds of one clock, and call "
-                "reset if it starts again"
+                "reset, or restart of a supervisor, if it starts again"
             )
             if is_pause(elapsed):
                 raise ImpossibleMeasurement("time", reason)
             seen = self._bridge(seen, "time", Doubt("time", reason), self._dt)
+            seen = seen._replace(clock=seen.clock._replace(standing=seen.clock.standing + 1))
             measured["time"] = np.array([seen.clock.time])
             return seen, 0, 0.0
         if clock.standing >= MOST_STANDING:

@@ -11,7 +11,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from bounce_mjx.deploy.box import Box, checked_box
-from bounce_mjx.deploy.clock import MOST_LATE, Clock, advance
+from bounce_mjx.deploy.clock import MOST_LATE, Clock, Witness, advance, begin_anew, look
 from bounce_mjx.deploy.controller import Controller, Memory
 from bounce_mjx.deploy.driver import LARGEST, Driver
 from bounce_mjx.deploy.faults import Fault, Followed, Watch, check_balls, picture_age
@@ -25,7 +25,7 @@ from bounce_mjx.deploy.rest import (
     follow_target,
     place_of,
 )
-from bounce_mjx.deploy.samples import Measurements
+from bounce_mjx.deploy.samples import Measurements, Seen
 from bounce_mjx.errors import UserError
 
 State = Literal["homing", "ready", "running", "braking", "stopped"]
@@ -71,6 +71,8 @@ class Progress(NamedTuple):
     """The controller's own, before the arm was found."""
     followed: Followed | None = None
     """The arm's last control steps, since it was found."""
+    witness: Witness = Witness()
+    """The clocks, since the begin or the last restart."""
     waits_for: str | None = None
     """Why the arm waits on its way home."""
     waits_since: float | None = None
@@ -134,8 +136,6 @@ class Supervisor:
         self._box = checked_box(box)
         self._has_box = bool(np.any(np.isfinite(self._box)))
         self._watch = Watch(self._metadata)
-        self._host_start: float | None = None
-        """The host's time at the first sample, if the driver gives none, s."""
         # A stop may come within any other call, from another thread or a signal handler: it is one
         # assignment, which `restart` alone takes back.
         self._stop: Stop | None = None
@@ -188,7 +188,7 @@ class Supervisor:
 
     def restart(self, moved: bool = False, targets: Sequence[float] | None = None) -> None:
         """Goes home after a stop, for the next `start`. The commands go on where they rest, and
-        nothing is sent until the arm is there.
+        nothing is sent until the arm is there. The driver's clock may have begun anew.
 
         Args:
           moved: whether the arm was moved with its servos off. Its commands then begin anew, as the
@@ -212,7 +212,6 @@ class Supervisor:
 
     def _restarted(self, moved: bool, targets: Sequence[float] | None) -> Progress:
         progress = self._progress
-        seen = progress.memory.seen
         course = progress.memory.course
         if targets is not None:
             values = self._driver.read_joints("the targets", targets, "rad", LARGEST)
@@ -220,7 +219,7 @@ class Supervisor:
             course = self._controller.motion.resting(values)
         elif moved:
             course = None
-        memory = self._controller.episode(seen, course)
+        memory = self._controller.episode(Seen(), course)
         return Progress(memory, has_begun=progress.has_begun)
 
     def commands(self, measurements: Mapping[str, Any]) -> np.ndarray:
@@ -240,76 +239,91 @@ class Supervisor:
           Exception: anything fails before the supervisor has given a command, mostly a `UserError`,
             as the first joint angles are wrong. Afterwards nothing is raised, and the arm brakes.
         """
+        host = time.monotonic()
         progress = self._progress
         steps = 0
         if self._stop is None:
             try:
-                progress, steps = self._next(progress, measurements)
+                progress, steps = self._next(progress, measurements, host)
             except Exception as error:
                 if not (progress.has_begun or isinstance(error, Fault)):
                     raise
                 self.stop(*_fault_of(error))
         if self._stop is not None:
             # What this step was to send is not sent.
-            progress, steps = self._brake(self._progress, measurements)
+            progress, steps = self._brake(self._progress, measurements, host)
         course = progress.memory.course
         has_commands = course is not None and progress.has_found_arm
+        if steps:
+            progress = progress._replace(witness=progress.witness._replace(stepped=host))
         self._progress = progress._replace(has_begun=progress.has_begun or has_commands)
         if steps == 0 or not has_commands:
             return np.zeros((0, len(self._home)))
         return self._driver.to_driver(self._controller.motion.at(course, self._times))
 
-    def _next(self, progress: Progress, measurements: Mapping[str, Any]) -> tuple[Progress, int]:
-        """What is known after a call, and the control steps since the last one.
+    def _next(
+        self, progress: Progress, measurements: Mapping[str, Any], host: float
+    ) -> tuple[Progress, int]:
+        """What is known after a call at a time of the host (s), and the control steps since the
+        last one.
 
         Raises:
           UserError: the arm is to stop.
-        """
-        measurements = self._timed(measurements)
-        if progress.phase == "running":
-            return self._follow(progress, measurements)
-        of_arm = {name: value for name, value in measurements.items() if name in _OF_ARM}
-        measured = self._driver.check(of_arm, ("joint_angles",))
-        progress = progress._replace(balls=self._balls(measurements))
-        if not progress.has_found_arm:
-            return self._find_arm(progress, measured)
-        return self._go_home(progress, measured)
-
-    def _timed(self, measurements: Mapping[str, Any]) -> Mapping[str, Any]:
-        """The measurements with a time: the driver's own, or always that of the host.
-
-        Raises:
-          UserError: they have no names, or a time comes in some samples alone.
         """
         if not isinstance(measurements, Mapping):
             raise UserError(
                 f"the measurements are {str(measurements)[:100]!r}; give a mapping of their names, "
                 "such as joint_angles"
             )
-        has_time = "time" in measurements
-        is_first = self._progress.memory.seen.clock.step < 0
-        if not has_time and self._host_start is None:
-            if not is_first:
+        waited = progress.witness.waited(host)
+        if progress.phase == "running":
+            # Of a policy that does not see them, the arm needs the angles all the same.
+            needs = tuple(dict.fromkeys((*self._driver.needs, "joint_angles")))
+            measured = self._driver.check(measurements, needs)
+            progress = self._timed(progress, measured, host)
+            return self._follow(progress, measured, waited)
+        of_arm = {name: value for name, value in measurements.items() if name in _OF_ARM}
+        measured = self._driver.check(of_arm, ("joint_angles",))
+        progress = self._timed(progress, measured, host)
+        progress = progress._replace(balls=self._balls(measurements))
+        if not progress.has_found_arm:
+            return self._find_arm(progress, measured, waited)
+        return self._go_home(progress, measured, waited)
+
+    def _timed(self, progress: Progress, measured: Measurements, host: float) -> Progress:
+        """What is known with the time of a sample, which gets the time that is believed.
+
+        Raises:
+          UserError: a time comes in some samples alone, or too many were not believed.
+        """
+        given = float(measured["time"][0]) if "time" in measured else None
+        witness = progress.witness
+        if witness.host is not None and witness.has_time != (given is not None):
+            if witness.has_time:
                 raise UserError(
                     "the measurement time is missing, and was given before; give it in every sample"
                 )
-            self._host_start = time.monotonic()
-        if has_time:
-            if self._host_start is not None and not is_first:
-                raise UserError(
-                    "the measurement time is given, and was not before; give it in every sample, "
-                    "or in none"
-                )
-            self._host_start = None
-            return measurements
-        return {**measurements, "time": time.monotonic() - self._host_start}
+            raise UserError(
+                "the measurement time is given, and was not before; give it in every sample, "
+                "or in none"
+            )
+        witness, is_believed = look(witness, given, host)
+        measured["time"] = np.array([witness.time])
+        progress = progress._replace(witness=witness)
+        if is_believed:
+            return progress
+        memory = progress.memory
+        seen = self._controller.samples.bridge_time(memory.seen, given, witness.time)
+        return progress._replace(memory=memory._replace(seen=seen))
 
-    def _find_arm(self, progress: Progress, measured: Measurements) -> tuple[Progress, int]:
+    def _find_arm(
+        self, progress: Progress, measured: Measurements, waited: float | None
+    ) -> tuple[Progress, int]:
         """Waits until the arm is measured where it rests, from where its commands begin or go
         on."""
         memory = progress.memory
         of_time = {"time": measured["time"]}
-        seen, _, steps = self._controller.samples.take(memory.seen, of_time)
+        seen, _, steps = self._controller.samples.take(memory.seen, of_time, None, waited)
         angles = measured["joint_angles"]
         self._controller.samples.check_range("angle", angles)
         target = follow_target(progress.target, measured)
@@ -338,8 +352,10 @@ class Supervisor:
             check_place(self._metadata, angles, place, room, where)
             check_tool(self._metadata, measured)
         except Unknown as unknown:
+            if not is_place_known:
+                return progress._replace(waits_for=str(unknown), waits_since=None), steps
             since = now if progress.waits_since is None else progress.waits_since
-            if is_place_known and now - since > _SETTLING:
+            if now - since > _SETTLING:
                 raise Fault("joint_astray", str(unknown)) from None
             return progress._replace(waits_for=str(unknown), waits_since=since), steps
         seen = self._controller.samples.rest(seen, angles)
@@ -353,10 +369,13 @@ class Supervisor:
         )
         return self._move_home(progress, angles, max(steps, 1))
 
-    def _go_home(self, progress: Progress, measured: Measurements) -> tuple[Progress, int]:
+    def _go_home(
+        self, progress: Progress, measured: Measurements, waited: float | None
+    ) -> tuple[Progress, int]:
         """A step of the way home, or at home."""
         before = progress.memory.seen.clock
-        seen, measured, steps = self._controller.samples.take(progress.memory.seen, measured)
+        samples = self._controller.samples
+        seen, measured, steps = samples.take(progress.memory.seen, measured, None, waited)
         self._check_pace(before, seen.clock)
         progress = progress._replace(memory=progress.memory._replace(seen=seen))
         if steps == 0:
@@ -374,7 +393,7 @@ class Supervisor:
         """The next commands on the way home of an arm at angles [J]."""
         motion = self._controller.motion
         last = progress.memory.course
-        if steps > 1:
+        if progress.memory.seen.clock.has_waited:
             last = motion.stopped(last)
         if np.abs(motion.target(last) - self._home).max() > _HOME_TOLERANCE:
             course = motion.move(last, self._home, _HOME_SPEED)
@@ -409,18 +428,17 @@ class Supervisor:
             return progress._replace(phase="homing", waits_for=str(unknown), waits_since=since)
         return progress._replace(phase="ready", waits_for=None, waits_since=None)
 
-    def _follow(self, progress: Progress, measurements: Mapping[str, Any]) -> tuple[Progress, int]:
+    def _follow(
+        self, progress: Progress, measured: Measurements, waited: float | None
+    ) -> tuple[Progress, int]:
         """A step of the policy."""
         controller = self._controller
-        # Of a policy that does not see them, the arm needs the angles all the same.
-        needs = tuple(dict.fromkeys((*self._driver.needs, "joint_angles")))
-        measured = self._driver.check(measurements, needs)
         command = controller.motion.target(progress.memory.course)
         clock = progress.memory.seen.clock
         late = advance(clock, float(measured["time"][0]), self._dt)[2] - 1
         if late > self._max_steps_late:
             raise Fault("late_step", f"a control step came {late} steps late")
-        memory, measured, steps = controller.take(progress.memory, measured)
+        memory, measured, steps = controller.take(progress.memory, measured, waited)
         seen = memory.seen
         self._check_pace(clock, seen.clock)
         if steps == 0:
@@ -447,21 +465,23 @@ class Supervisor:
                 f"after the one before; call commands every {1e3 * self._dt:g} ms",
             )
 
-    def _brake(self, progress: Progress, measurements: Mapping[str, Any]) -> tuple[Progress, int]:
+    def _brake(
+        self, progress: Progress, measurements: Mapping[str, Any], host: float
+    ) -> tuple[Progress, int]:
         """A step in which the commands brake or rest, whatever is measured."""
         memory = progress.memory
         stop = self._stop
         if memory.course is None or not progress.has_found_arm:
-            # Nothing was sent.
+            # Nothing has been sent since the begin, or the restart.
             self._stop = stop._replace(is_at_rest=True)
             return progress, 0
-        clock, steps = self._braking_time(progress, measurements)
-        memory = memory._replace(seen=memory.seen._replace(clock=clock))
-        progress = progress._replace(memory=memory)
+        progress, steps = self._braking_time(progress, measurements, host)
+        memory = progress.memory
+        clock = memory.seen.clock
         if steps == 0:
             return progress, 0
         motion = self._controller.motion
-        last = motion.stopped(memory.course) if steps > 1 else memory.course
+        last = motion.stopped(memory.course) if clock.has_waited else memory.course
         course = motion.hold(last)
         memory = memory._replace(course=course)
         progress = progress._replace(memory=memory, phase="homing", waits_for=None)
@@ -473,19 +493,37 @@ class Supervisor:
         is_there = self._is_not_moved(progress, measurements)
         return progress._replace(has_found_arm=progress.has_found_arm and is_there), steps
 
-    def _braking_time(self, progress: Progress, measurements: Mapping[str, Any]) -> tuple:
-        """The clock while the arm brakes, and the control steps since the last call: one, if the
-        driver's time cannot be read or stands."""
-        clock = progress.memory.seen.clock
+    def _braking_time(
+        self, progress: Progress, measurements: Mapping[str, Any], host: float
+    ) -> tuple[Progress, int]:
+        """The clocks while the arm brakes, and the control steps since the last call: by the host's
+        if the driver's has agreed with it; else by the driver's, and one if that cannot be read,
+        stands or goes back."""
+        memory = progress.memory
+        clock = memory.seen.clock
+        witness = progress.witness
+        if witness.is_agreed:
+            waited = witness.waited(host)
+            witness = witness.at_host(host)
+            clock, _, steps = advance(clock, witness.time, self._dt, waited)
+        else:
+            given = self._given_time(measurements)
+            new, elapsed, steps = advance(clock, given, self._dt)
+            if given is None or elapsed <= 0.0:
+                clock = begin_anew(clock, given, self._dt)
+                steps = 1
+            else:
+                clock = new
+        memory = memory._replace(seen=memory.seen._replace(clock=clock))
+        return progress._replace(memory=memory, witness=witness), steps
+
+    def _given_time(self, measurements: Mapping[str, Any]) -> float | None:
+        """The driver's time, s; None if it cannot be read."""
         try:
-            time_now = float(self._timed(measurements)["time"])
-        except (UserError, TypeError, ValueError):
-            time_now = math.nan
-        if math.isfinite(time_now):
-            new, elapsed, steps = advance(clock, time_now, self._dt)
-            if elapsed > 0.0:
-                return new, steps
-        return clock._replace(now=clock.now + self._dt), 1
+            given = {"time": measurements["time"]}
+            return float(self._driver.check(given, ())["time"][0])
+        except (UserError, KeyError, TypeError):
+            return None
 
     def _is_not_moved(self, progress: Progress, measurements: Mapping[str, Any]) -> bool:
         """Whether a stopped arm is where its commands rest, has had no time to settle, or is not
