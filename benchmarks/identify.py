@@ -19,10 +19,11 @@ import numpy as np
 
 from bounce_mjx import load_policy
 from bounce_mjx.deploy.recorder import Recorder
+from bounce_mjx.identify import Topics
 from bounce_mjx.identify.estimates import estimates
 from bounce_mjx.identify.excitation import excite
 from bounce_mjx.identify.identification import Identified, identify
-from bounce_mjx.identify.reading import read_csv
+from bounce_mjx.identify.reading import read_log
 from bounce_mjx.identify.world_file import to_yaml
 from bounce_mjx.physics import CEngine, edited_model
 from bounce_mjx.resources import resource_path
@@ -376,7 +377,7 @@ def measure(config: WorldConfig, hidden: Hidden, path: Path) -> dict[str, Any]:
     home = np.array(config.default_joint_angles)
     begin = time.perf_counter()
     begin_processor = time.process_time()
-    log = read_csv(path, names)
+    log = read_log(path, model, Topics())
     found = identify(config, log)
     seconds = time.perf_counter() - begin
     processor = time.process_time() - begin_processor

@@ -206,10 +206,6 @@ def _exact_follower(
         }
         begins.append(Fit(layout.clip(layout.vector(world)), windows.starts))
     fits = minimise_each(problem, begins, [], few, 2, windows.arm_state)
-    # A simulated servo is not as late as its stiffness and damping say, to some hundredths of a
-    # millisecond.
-    begins = [_in_time(problem, fit) for fit in fits]
-    fits = minimise_each(problem, begins, [], few, 2, windows.arm_state)
     best: dict[float, tuple[float, Fit]] = {}
     for (gain, _), fit in zip(tried, fits, strict=True):
         size = float(np.sum(joint_errors(windows, fit) ** 2)) if np.isfinite(fit.cost) else np.inf
@@ -220,27 +216,6 @@ def _exact_follower(
     fit = best[gain][1]._replace(starts=windows.starts)
     problem = in_units_of_errors(problem, best[gain][1])
     return problem, with_offsets(problem, fit, seen_windows(problem))
-
-
-def _in_time(problem: Problem, fit: Fit) -> Fit:
-    """The fit with the delay at which its joints are where they were measured: from the error of
-    the angles along their velocity."""
-    windows = problem.windows
-    layout = problem.layout
-    angles, weights = (windows.split(rows)[0] for rows in (fit.predicted, fit.weights))
-    steps = np.diff(windows.angle_times, axis=1)[:, :, None]
-    counts = (weights[:, 1:] > 0.0) & (weights[:, :-1] > 0.0) & (steps > 0.0)
-    velocity = np.where(counts, np.diff(angles, axis=1) / np.where(counts, steps, 1.0), 0.0)
-    early = angles - windows.angles
-    early = np.where(counts, 0.5 * (early[:, 1:] + early[:, :-1]), 0.0)
-    early -= np.sum(early, axis=(0, 1)) / np.maximum(np.sum(counts, axis=(0, 1)), 1)
-    motion = float(np.sum(velocity**2))
-    vector = fit.vector.copy()
-    if np.isfinite(motion) and motion > 0.0:
-        # A simulation that runs ahead is off by its velocity times the time.
-        vector[layout.slices["delay"]] += np.sum(np.where(counts, early * velocity, 0.0)) / motion
-    vector = np.clip(vector, *layout.bounds(vector))
-    return fit._replace(vector=vector, starts=windows.starts)
 
 
 def _search_arm(
