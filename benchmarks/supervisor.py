@@ -3,7 +3,7 @@ the arm brakes.
 
     python benchmarks/supervisor.py robust --episodes 1024 --jobs 16
     python benchmarks/supervisor.py robust --episodes 1024 --latencies 0.06 0.03
-    python benchmarks/supervisor.py --episodes 128
+    python benchmarks/supervisor.py --episodes 128 --no-faults
 
 The last line is for every policy that comes with the package, each in its own worlds. What a policy
 measured in an episode is given to the rules step by step; the first alarm is printed, and it is
@@ -166,12 +166,14 @@ def delays(
     return times
 
 
-def judge(metadata: Metadata, episode: dict[str, np.ndarray], seed: int) -> Found:
-    """What the rules say about one episode and about faults in it."""
+def judge(
+    metadata: Metadata, episode: dict[str, np.ndarray], seed: int, has_faults: bool = True
+) -> Found:
+    """What the rules say about one episode and, if it is to have some, about faults in it."""
     length = int(np.sum(episode["running"]))
     episode = {name: values[:length].astype(float) for name, values in episode.items()}
     at, fault, bridged = first_alarm(metadata, episode)
-    late = delays(metadata, episode, np.random.default_rng(seed))
+    late = delays(metadata, episode, np.random.default_rng(seed)) if has_faults else {}
     return Found(length, at, fault, bridged, late)
 
 
@@ -199,6 +201,7 @@ def main() -> None:
     parser.add_argument("policies", nargs="*", default=list(POLICIES), help="names")
     parser.add_argument("--episodes", type=int, default=128, help="rounded up to whole batches")
     parser.add_argument("--latencies", type=float, nargs=2, help="of action and ball, s")
+    parser.add_argument("--no-faults", action="store_true", help="count false alarms alone")
     parser.add_argument("--seed", type=int, default=0, help="of the episodes")
     parser.add_argument("--jobs", type=int, default=1, help="processes at once")
     given = parser.parse_args()
@@ -215,7 +218,9 @@ def main() -> None:
                 rows = jax.tree.map(np.asarray, run(jax.random.key(1000 * given.seed + number)))
                 for n in range(batch):
                     episode = {key: value[n] for key, value in rows.items()}
-                    found.append(pool.submit(judge, metadata, episode, number * batch + n))
+                    seed = number * batch + n
+                    task = pool.submit(judge, metadata, episode, seed, not given.no_faults)
+                    found.append(task)
             waiting.append((name, found, rows["running"].shape[1]))
         for name, found, steps in waiting:
             report(name, [one.result() for one in found], steps)

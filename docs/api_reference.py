@@ -101,9 +101,9 @@ _SECTIONS = (
         "adapters.sb3.Sb3VecEnv adapters.torch.vector_env.TorchVectorEnv "
         "adapters.torch.vector_env.StepResult adapters.torch.rsl_rl_env.RslRlVecEnv "
         "adapters.torch.skrl_env.SkrlEnv adapters.torch.policy.to_policy "
-        "adapters.torch.policy.write_run adapters.brax.environment.BraxBounceBall "
-        "adapters.gymnax_env.GymnaxBounceBall adapters.gymnax_env.PureJaxRLBounceBall "
-        "adapters.playground.environment.PlaygroundBounceBall adapters.brax.ppo.ppo_settings "
+        "adapters.torch.policy.write_run adapters.brax.environment.BraxTaskEnv "
+        "adapters.gymnax_env.GymnaxTaskEnv adapters.gymnax_env.PureJaxRLTaskEnv "
+        "adapters.playground.environment.PlaygroundTaskEnv adapters.brax.ppo.ppo_settings "
         "adapters.brax.ppo.network_settings adapters.brax.ppo.load_brax_policy",
     ),
 )

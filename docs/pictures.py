@@ -185,10 +185,10 @@ def rollout(observation=None, randomization=None, seconds=3.0, target=0.5):
     from bounce_mjx.learning.policy import make_networks
     from bounce_mjx.runs.checkpoints import read_policy
     from bounce_mjx.runs.config import load_run_config
-    from bounce_mjx.runs.folders import pretrained_checkpoint
+    from bounce_mjx.runs.folders import find_checkpoint
     from bounce_mjx.task.bounce import Config as EnvConfig
 
-    checkpoint = pretrained_checkpoint()
+    checkpoint = find_checkpoint("pretrained")
     config = load_run_config(checkpoint.run)
     layout = EnvConfig().layout
     networks = make_networks(config.ppo, layout.size, 6)

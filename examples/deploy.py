@@ -1,11 +1,11 @@
 """A policy's program on a simulated arm: with another driver, it is that of a real one.
 
 `python examples/deploy.py [POLICY]` plays against MuJoCo's C engine, with the delays and the noise
-in the middle of the policy's training; `ur_rtde_bridge.py` has the same loop, `play`, with the
-driver of a Universal Robot. With `--log`, it writes the log from which `bounce-mjx identify`
-estimates the robot's world. With `--cameras`, the ball is seen in rendered pictures of two cameras
-alone (`bounce_mjx.vision`), which the arm has calibrated before; that needs OpenCV too.
-`bounce-mjx rehearse` does the same in any world, with faults.
+in the middle of the policy's training, in the loop `play`, which takes any driver. With `--log`, it
+writes the log from which `bounce-mjx identify` estimates the robot's world. With `--cameras`, the
+ball is seen in rendered pictures of two cameras alone (`bounce_mjx.vision`), which the arm has
+calibrated before; that needs OpenCV too. `bounce-mjx rehearse` does the same in any world, with
+faults.
 """
 
 import argparse

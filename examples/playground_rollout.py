@@ -15,7 +15,7 @@ import mediapy
 from mujoco_playground import registry, wrapper
 
 from bounce_mjx import Run, environment
-from bounce_mjx.adapters.playground import PlaygroundBounceBall
+from bounce_mjx.adapters.playground import PlaygroundTaskEnv
 from bounce_mjx.viewers.video import find_ffmpeg
 
 TARGET_HEIGHT = 0.5
@@ -32,7 +32,7 @@ def main(
 ) -> jax.Array:
     """Bounces the ball in several worlds and films the first; the final heights [B], m."""
     task = environment(policy=policy, target_height_range=(TARGET_HEIGHT, TARGET_HEIGHT))
-    env = PlaygroundBounceBall(task)
+    env = PlaygroundTaskEnv(task)
     randomization_rng = jax.random.split(jax.random.PRNGKey(0), num_envs)
     randomization_fn = functools.partial(
         registry.get_domain_randomizer("BounceBall"), rng=randomization_rng

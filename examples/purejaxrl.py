@@ -14,7 +14,7 @@ import optax
 from flax import linen as nn
 
 from bounce_mjx import environment
-from bounce_mjx.adapters.gymnax_env import EnvState, PureJaxRLBounceBall
+from bounce_mjx.adapters.gymnax_env import EnvState, PureJaxRLTaskEnv
 
 GAMMA = 0.98
 GAE_LAMBDA = 0.95
@@ -26,7 +26,7 @@ NUM_MINIBATCHES = 8
 # A reward is up to 12 a step, which would be large for the value network.
 REWARD_SCALE = 0.1
 
-env = PureJaxRLBounceBall(environment())
+env = PureJaxRLTaskEnv(environment())
 network = nn.Sequential([nn.Dense(128), nn.tanh, nn.Dense(env.num_actions + 1)])
 tx = optax.adam(LEARNING_RATE)
 

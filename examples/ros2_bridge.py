@@ -15,8 +15,8 @@ ur_rtde_bridge.py), also tells whether it is the policy's arm. A pose of TF does
 /joint_states and a file.
 
 Publish a message on /start for each episode; where the arm has stopped, one sends it home first. If
-the arm was moved with its servos off, start the program again. Read "Safety steps" in
-docs/real-robot.md first.
+the arm was moved with its servos off, start the program again. Read "Safety" in docs/your-arm.md
+first.
 """
 
 import argparse

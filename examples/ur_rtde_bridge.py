@@ -8,7 +8,7 @@ arm rests until Enter sends it home.
 
 Set the tool centre point on the pendant to the paddle's centre, with its z along the paddle's upper
 normal: nothing is sent to an arm whose controller has the paddle elsewhere than the policy, such as
-a UR3e under the policy of a UR5e. Read "Safety steps" in docs/real-robot.md first.
+a UR3e under the policy of a UR5e. Read "Safety" in docs/your-arm.md first.
 """
 
 import argparse

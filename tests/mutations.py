@@ -155,7 +155,7 @@ FAULTS = [
     ("a stopped training saves nothing", "training/job.py",
      "        if self.needs_save:\n            self.save()\n", "", "test_job.py -k signal_saves"),
     ("a training ends a block too early", "training/job.py",
-     "self.steps >= self.config.total_steps", "self.steps + self.block_steps >= self.config.total_steps", "test_job.py -k whole_block_nearest"),
+     "self.steps >= self.config.total_steps", "self.steps + self.steps_per_block >= self.config.total_steps", "test_job.py -k whole_block_nearest"),
     ("results end a training that was not to stop", "training/job.py",
      "return self.config.stop_when_solved and solved", "return solved", "test_job.py -k results_have_a_margin"),
     ("a policy that was not saved stays the best", "training/seeds.py",

@@ -20,7 +20,7 @@ from brax.training.agents.sac import train as brax_sac
 
 from bounce_mjx import EnvConfig
 from bounce_mjx.adapters.brax import (
-    BraxBounceBall,
+    BraxTaskEnv,
     device_put_replicated,
     load_brax_policy,
     ppo,
@@ -38,7 +38,7 @@ def all_finite(tree) -> bool:
 
 def test_brax_makes_the_environment():
     env = brax.envs.get_environment("bounce_ball", target_height_range=(0.7, 0.7))
-    assert isinstance(env, BraxBounceBall) and isinstance(env.task, brax.envs.Env)
+    assert isinstance(env, BraxTaskEnv) and isinstance(env.core, brax.envs.Env)
     config = EnvConfig(target_height_range=(0.7, 0.7), control_dt=0.02)
     wrapped = brax.envs.create(
         "bounce_ball", episode_length=5, batch_size=2, config=config, control_dt=0.01

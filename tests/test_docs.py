@@ -40,7 +40,7 @@ from bounce_mjx.task.bounce_rewards import RewardInputs, Rewards
 from bounce_mjx.task.registry import find_task
 from bounce_mjx.training import hosts
 from bounce_mjx.training.command import fields_of_command
-from bounce_mjx.training.run import Run, notes_on_starts
+from bounce_mjx.training.run import Run, notes_on_learning_rate
 from bounce_mjx.world.randomization import TERMS
 from tiny_runs import shared_run
 
@@ -443,7 +443,7 @@ def short_training(folder: Path) -> Callable:
         calls.append(settings)
         if len(calls) > 1:  # the page's sweep
             config = read_layers(Choice()).config(settings)
-            assert not notes_on_starts(config)
+            assert not notes_on_learning_rate(config)
             return config
         return real(*given, callbacks=callbacks, **settings | short, log_dir=folder)
 

@@ -125,10 +125,10 @@ def test_each_task_of_the_package_has_a_name() -> None:
     assert own == {*TASKS, "bounce"}
     for name in TASKS:
         env = gymnasium.make(f"bounce_mjx/{name.title()}-v0")
-        assert isinstance(env.get_wrapper_attr("task").task, find_task(name))
+        assert isinstance(env.get_wrapper_attr("core").task, find_task(name))
     env = gymnasium.make("bounce_mjx/Juggle-v0")
     observation, _ = env.reset(seed=0, options={"target_height": 0.5})
-    layout = env.get_wrapper_attr("task").layout
+    layout = env.get_wrapper_attr("core").layout
     assert layout["ball_position"].stop - layout["ball_position"].start == 6
     assert observation[layout["target_height"]] == pytest.approx(0.5)
 

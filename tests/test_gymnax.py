@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 
 from bounce_mjx import environment
-from bounce_mjx.adapters.gymnax_env import GymnaxBounceBall, PureJaxRLBounceBall
+from bounce_mjx.adapters.gymnax_env import GymnaxTaskEnv, PureJaxRLTaskEnv
 from bounce_mjx.errors import UserError
 
 LIMIT = 3
 
 
 @pytest.fixture(scope="module")
-def env() -> PureJaxRLBounceBall:
-    return PureJaxRLBounceBall(
+def env() -> PureJaxRLTaskEnv:
+    return PureJaxRLTaskEnv(
         environment(episode_seconds=0.01 * LIMIT, target_height_range=(0.4, 0.6))
     )
 
@@ -39,10 +39,10 @@ def test_steps_are_those_of_the_task_until_the_time_limit(env):
     the last one is in the info of gymnax's form. PureJaxRL, which keeps every info, gets none of
     it."""
     observation, state = env.reset(jax.random.key(0))
-    plain = jax.jit(env.task.reset)(jax.random.key(0))
+    plain = jax.jit(env.core.reset)(jax.random.key(0))
     np.testing.assert_array_equal(observation, plain.obs)
-    plain_step = jax.jit(env.task.step)
-    step = functools.partial(GymnaxBounceBall.step, env)
+    plain_step = jax.jit(env.core.step)
+    step = functools.partial(GymnaxTaskEnv.step, env)
     assert env.default_params.max_steps_in_episode == LIMIT
     for i in range(LIMIT):
         action = 0.1 * jax.random.normal(jax.random.key(i), (6,))
@@ -64,7 +64,7 @@ def test_steps_are_those_of_the_task_until_the_time_limit(env):
 @pytest.mark.slow
 def test_the_parameters_set_the_time_limit_and_a_fall_terminates(env):
     """In the form of gymnax 1.x, whose steps tell the two ends apart."""
-    step = functools.partial(GymnaxBounceBall.step, env)
+    step = functools.partial(GymnaxTaskEnv.step, env)
     params = env.default_params.replace(max_steps_in_episode=1)
     _, state = env.reset(jax.random.key(0), params)
     *_, terminated, truncated, _ = step(jax.random.key(1), state, jnp.zeros(6), params)
@@ -97,7 +97,7 @@ def test_spaces_and_settings(env, gymnax):
 
 
 def test_gymnax_own_wrapper_logs_episodes(gymnax):
-    wrapped = gymnax.LogWrapper(GymnaxBounceBall(environment(episode_seconds=0.02)))
+    wrapped = gymnax.LogWrapper(GymnaxTaskEnv(environment(episode_seconds=0.02)))
     _, state = wrapped.reset(jax.random.key(0))
     rewards = []
     for i in range(2):

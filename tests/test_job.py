@@ -418,12 +418,16 @@ def test_a_callback_sees_blocks_and_evaluations_and_ends_the_training(tmp_path: 
 def test_an_error_in_a_callback_ends_the_training_once_all_is_saved(
     tmp_path: Path, is_at_evaluation: bool
 ) -> None:
-    """Nothing that was trained is lost, and the other callbacks know the event."""
+    """Nothing that was trained is lost, and the other callbacks know the event. As after a signal,
+    an evaluation that is due is left out; and the callback is called no more."""
     seen = []
+    failed = 0
 
     def fail(event: Event) -> None:
+        nonlocal failed
         is_evaluation = event.report is not None
-        if event.steps == 2 * BLOCK and is_evaluation == is_at_evaluation:
+        if event.steps == 2 * BLOCK and is_evaluation >= is_at_evaluation:
+            failed += 1
             raise RuntimeError("pruned")
 
     said = io.StringIO()
@@ -431,11 +435,24 @@ def test_an_error_in_a_callback_ends_the_training_once_all_is_saved(
     with pytest.raises(RuntimeError, match="pruned"):
         train(tmp_path, {1: 5.0, 2: 9.0, 3: 7.0}, callbacks=callbacks, said=said)
     (run,) = tmp_path.iterdir()
-    assert seen[-1] == 2 * BLOCK
+    assert seen == [BLOCK, BLOCK, *([2 * BLOCK] * (1 + is_at_evaluation))]
+    assert failed == 1
     assert "a callback failed after 128 steps; continue with: bounce-mjx train" in said.getvalue()
     assert iterations_of(latest_checkpoint(run)) == 2
     train(tmp_path, {2: 9.0, 3: 7.0}, run)
     assert results_of(run)["best_steps"] == 2 * BLOCK
+
+
+def test_a_callback_that_failed_for_one_seed_is_not_called_for_another(tmp_path: Path) -> None:
+    seen = []
+
+    def fail(event: Event) -> None:
+        seen.append(event.config.seed)
+        raise RuntimeError("pruned")
+
+    with pytest.raises(RuntimeError, match="pruned"):
+        train(tmp_path, {1: 5.0, 2: 9.0}, callbacks=[fail], num_seeds=2)
+    assert seen == [0]
 
 
 def test_an_error_in_a_callback_is_the_cause_where_its_state_cannot_be_saved(

@@ -171,7 +171,7 @@ def of_run(config: TrainConfig) -> tuple:
         patch.setattr("bounce_mjx.training.job.are_solved", lambda seeds: True)
         while not job.is_finished():
             blocks.append(job.steps)
-            job.steps += job.block_steps
+            job.steps += job.steps_per_block
         nothing = types.SimpleNamespace(compile=lambda: None)
         patch.setattr(Evaluators, "_lower", lambda _: nothing)
         patch.setattr(Evaluators, "_run", lambda *given: measured.append(given[2]))

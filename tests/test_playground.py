@@ -71,7 +71,7 @@ def test_playground_has_the_other_tasks(task):
     name = f"BounceMjx{task.title()}"
     assert name in registry.ALL_ENVS
     env = registry.load(name)
-    assert isinstance(env.task.task, find_task(task))
+    assert isinstance(env.core.task, find_task(task))
     limit = find_task(task).Config().episode_steps
     assert registry.get_default_config(name).episode_length == limit
     parameters = manipulation_params.brax_ppo_config(name)

@@ -21,7 +21,7 @@ from bounce_mjx.deploy.wrappers import environments_in
 from bounce_mjx.errors import UserError
 from bounce_mjx.resources import POLICIES
 from bounce_mjx.runs.config import load_run_config
-from bounce_mjx.runs.folders import pretrained_checkpoint
+from bounce_mjx.runs.folders import find_checkpoint
 from bounce_mjx.task.bounce import Config as BounceConfig
 from bounce_mjx.world.randomization import RandomizationConfig
 
@@ -39,7 +39,7 @@ INSTALLED_POLICIES = [
 def slow_run(tmp_path_factory) -> Path:
     """A run whose control step is another one than the task's."""
     run = tmp_path_factory.mktemp("slow")
-    config = load_run_config(pretrained_checkpoint().run)
+    config = load_run_config(find_checkpoint("pretrained").run)
     env = config.env.model_copy(update={"control_dt": 0.008})
     (run / "config.yaml").write_text(dump_config(config.model_copy(update={"env": env})))
     return run
@@ -214,10 +214,10 @@ def test_a_wrapper_of_brax_that_repeats_an_action_is_refused(need) -> None:
     need("brax")
     from brax.envs.wrappers import training
 
-    from bounce_mjx.adapters.brax import BraxBounceBall
+    from bounce_mjx.adapters.brax import BraxTaskEnv
 
     run = Run("pretrained")
-    for env in (BounceBall(), BraxBounceBall(environment())):
+    for env in (BounceBall(), BraxTaskEnv(environment())):
         assert run.policy_in(training.wrap(env, 100))
         with pytest.raises(UserError, match="EpisodeWrapper may change .* the control step"):
             run.policy_in(training.wrap(env, 100, action_repeat=4))
@@ -249,7 +249,7 @@ def _make(library: str, need, **settings):
         case "brax":
             return _adapter("brax", "make_env", need)(**settings)
         case "gymnax":
-            return _adapter("gymnax_env", "GymnaxBounceBall", need)(environment(**settings))
+            return _adapter("gymnax_env", "GymnaxTaskEnv", need)(environment(**settings))
         case "playground":
             make = _adapter("playground.environment", "make_env", need, "mujoco_playground")
             return make(**settings)
@@ -298,7 +298,7 @@ def test_every_library_gets_the_environment_of_the_policy(name: str, slow_run: P
 
 def test_a_policy_refuses_another_environment(slow_run: Path) -> None:
     """Of each thing that gives its numbers another meaning, whichever way they meet."""
-    config = load_run_config(pretrained_checkpoint().run).env
+    config = load_run_config(find_checkpoint("pretrained").run).env
     for change, words in (
         ({"action": {"base": "target"}}, "its action base is measured, there target"),
         ({"action_scale": 0.03}, "its action scale is 0.02 rad, there 0.03 rad"),
@@ -370,7 +370,7 @@ def test_a_setting_without_an_effect_is_refused(library: str, need) -> None:
             # A group that is given in part keeps the other values.
             drag = BounceConfig(randomization={"air_drag": (0.1, 0.2)})
             both = _make(library, need, config=drag, randomization={"ball_mass": (0.5, 2.0)})
-            assert both.task.config.randomization.terms == ("ball_mass", "air_drag")
+            assert both.core.config.randomization.terms == ("ball_mass", "air_drag")
         case _:
             refused = [(warmup, "its ranges do not grow here; set warmup_steps to 0")]
     for settings, words in refused:

@@ -23,11 +23,11 @@ from bounce_mjx.runs.folders import (
     MIRROR_LAW,
     best_checkpoint,
     choose_checkpoint,
+    find_checkpoint,
     is_users_run,
-    pretrained_checkpoint,
 )
 from bounce_mjx.runs.layers import read_preset
-from bounce_mjx.runs.worlds import trained_in
+from bounce_mjx.runs.worlds import env_in_world
 from bounce_mjx.task.registry import find_task
 
 FOLDER = resource_path("pretrained")
@@ -41,10 +41,10 @@ def shipped() -> dict:
 
 def measured(name: str, episodes: int, world: str | None = None) -> Report:
     """The results of a shipped policy, in its own world or in a named one."""
-    checkpoint = pretrained_checkpoint(name)
+    checkpoint = find_checkpoint(name)
     config = load_run_config(checkpoint.run)
     if world:
-        config = config.model_copy(update={"env": trained_in(config.env, world)})
+        config = config.model_copy(update={"env": env_in_world(config.env, world)})
     policy, options = read_policy(checkpoint, config), EvaluationOptions(episodes)
     return evaluate_policy(policy, config.env, networks_of(config.ppo), options).report
 
@@ -163,7 +163,7 @@ def test_it_is_used_if_there_is_no_run(tmp_path: Path, monkeypatch, capsys) -> N
     with pytest.raises(UserError, match="no run with a checkpoint"):
         choose_checkpoint(None, tmp_path)
     monkeypatch.chdir(tmp_path)
-    assert choose_checkpoint(None, LOG_DIR) == pretrained_checkpoint()
+    assert choose_checkpoint(None, LOG_DIR) == find_checkpoint("pretrained")
     assert "comes with the package" in capsys.readouterr().out
     for name in ("2026-01-01", "2026-01-02"):
         folder = LOG_DIR / name / "checkpoints" / "64"
@@ -172,4 +172,4 @@ def test_it_is_used_if_there_is_no_run(tmp_path: Path, monkeypatch, capsys) -> N
     chosen = choose_checkpoint(None, LOG_DIR)
     assert chosen.folder.absolute() == folder.absolute()
     assert str(LOG_DIR / "2026-01-02") in capsys.readouterr().out
-    assert choose_checkpoint(FOLDER, LOG_DIR) == pretrained_checkpoint()
+    assert choose_checkpoint(FOLDER, LOG_DIR) == find_checkpoint("pretrained")

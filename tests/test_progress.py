@@ -12,7 +12,7 @@ import pytest
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.runs.checkpoints import read_policy
 from bounce_mjx.runs.config import TrainConfig, load_run_config
-from bounce_mjx.runs.folders import pretrained_checkpoint
+from bounce_mjx.runs.folders import find_checkpoint
 from bounce_mjx.runs.progress import Progress
 from bounce_mjx.runs.storage import to_json, write_output
 from bounce_mjx.task import Result
@@ -128,7 +128,7 @@ def test_a_pipe_that_the_user_names_stays_one() -> None:
 
 
 def test_a_policy_is_read_where_double_precision_is_on() -> None:
-    checkpoint = pretrained_checkpoint()
+    checkpoint = find_checkpoint("pretrained")
     config = load_run_config(checkpoint.run)
     single = read_policy(checkpoint, config)
     with jax.enable_x64(True):

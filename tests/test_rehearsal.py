@@ -3,12 +3,14 @@
 import math
 import re
 import runpy
+import shlex
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from arms import ARM
 from bounce_mjx import EnvConfig, load_policy
 from bounce_mjx.commands.main import main
 from bounce_mjx.deploy.environments import environment_config
@@ -250,3 +252,31 @@ def test_the_example_is_the_same_program_with_the_policy_of_any_task(monkeypatch
     monkeypatch.setattr("sys.argv", ["deploy.py", "catch", "--target-height", "0.5"])
     with pytest.raises(UserError, match="catch has no target height; omit --target-height"):
         example["main"]()
+
+
+@pytest.mark.slow
+def test_the_page_goes_from_an_arms_file_to_its_rehearsed_motion(tmp_path, monkeypatch) -> None:
+    """The commands of the first two days, with an arm of six joints; the policies' own are those
+    of the tests above."""
+    monkeypatch.chdir(tmp_path)
+    Path("my_arm.xml").write_text(ARM)
+    page = (EXAMPLE.parents[1] / "docs/your-arm.md").read_text(encoding="utf-8")
+    days = page.split("## Day 1")[1].split("## Day 3")[0]
+    lines = re.findall(r"^ {4}bounce-mjx (.+my_arm.+)$", days, re.MULTILINE)
+    assert [line.split()[0] for line in lines] == [
+        "adopt",
+        "view",
+        "excite",
+        "rehearse",
+        "identify",
+    ]
+    for line in lines:
+        words = shlex.split(line)
+        if words[0] == "view":
+            continue
+        if words[0] == "identify":
+            with pytest.raises(SystemExit, match="0"):
+                main(words)
+        else:
+            main(words)
+    assert Path("world.html").exists() and Path("simulated.csv").stat().st_size > 1_000_000

@@ -27,6 +27,7 @@ from bounce_mjx.config.user_code import import_code
 from bounce_mjx.deploy.export import policy_metadata
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.contacts import ContactChecker
+from bounce_mjx.physics import make_engine
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.actuators import ServoSettings, servo_settings
 from bounce_mjx.robot.adopt import adopt, check_as_alone
@@ -777,3 +778,67 @@ def test_an_arm_that_changes_in_the_scene_is_refused(field, tmp_path) -> None:
     getattr(model, field)[index] += 1e-4
     with pytest.raises(UserError, match=f"where its {field} differs by"):
         check_as_alone(found, model)
+
+
+IDLE = {
+    "a geom": ('size="0.04" ', 'size="0.04" solimp="1 1 0" solref="0.02 -100" '),
+    "a joint's limit": ('damping="0.1"', 'damping="0.1" solimplimit="1 1 0" solreflimit="1 -1"'),
+    "dry friction": ('damping="0.1"', 'damping="0.1" solimpfriction="1 1 0"'),
+}
+
+
+@pytest.mark.parametrize("setting", IDLE)
+def test_a_setting_that_cannot_act_is_reset_with_a_line(setting: str, tmp_path) -> None:
+    """MuJoCo takes each with a warning, and no engine has it where it acts."""
+    (tmp_path / "arm.xml").write_text(ARM.replace(*IDLE[setting]))
+    built = build_arm(tmp_path / "arm.xml", RobotConfig(site="tool"))
+    assert any(re.search(r"^reset the sol.+, where it cannot act$", x) for x in built.changes)
+    model = load_model(tmp_path / "arm.xml", 0.001, robot=RobotConfig(site="tool", **SERVOS))
+    assert make_engine(model, "auto").name == "fused"
+
+
+SERVOS = {"servo_stiffness": [1e3] * 6, "servo_damping": [20.0] * 6, "servo_force_limit": [1e2] * 6}
+
+
+def test_a_setting_that_acts_is_refused_by_its_name_in_the_file(tmp_path) -> None:
+    text = ARM.replace('damping="0.1"', 'damping="0.1" frictionloss="1" solimpfriction="1 1 0"')
+    (tmp_path / "arm.xml").write_text(text)
+    model = load_model(tmp_path / "arm.xml", 0.001, robot=RobotConfig(site="tool", **SERVOS))
+    with pytest.raises(UserError, match="support a joint's solimpfriction without a width"):
+        make_engine(model, "auto")
+
+
+def test_a_constraint_that_is_off_couples_nothing(tmp_path) -> None:
+    off = '<equality><joint joint1="j2" joint2="j3" active="false"/></equality>'
+    (tmp_path / "arm.xml").write_text(mjcf(arm(), motors(ARM_JOINTS), off))
+    assert build_arm(tmp_path / "arm.xml", RobotConfig(site="tool")).joint_names[1:3] == (
+        "j2",
+        "j3",
+    )
+
+
+def test_a_urdf_is_called_one_and_a_missing_mesh_is_to_be_put_there(tmp_path) -> None:
+    (tmp_path / "arm.urdf").write_text("no robot")
+    with pytest.raises(UserError, match=r"the URDF file \S+arm\.urdf does not compile"):
+        read_spec(tmp_path / "arm.urdf")
+    mesh = mjcf(arm(tip='<geom type="mesh" mesh="m"/>'), motors(ARM_JOINTS))
+    mesh = mesh.replace("<worldbody>", '<asset><mesh name="m" file="gone.stl"/></asset><worldbody>')
+    (tmp_path / "arm.xml").write_text(mesh)
+    with pytest.raises(UserError, match=r"opening file .+; put the file there"):
+        build_arm(tmp_path / "arm.xml", RobotConfig(site="tool"))
+
+
+def test_adopt_knows_an_arm_by_its_lengths_and_warns_of_slow_servos(tmp_path, capsys) -> None:
+    adopt_command.main([str(ur5e()), "--out", str(tmp_path / "ur5e.yaml")])
+    printed = capsys.readouterr().out
+    assert "warning: this is a ur5e: --robot ur5e has its manufacturer's limits" in printed
+    # kp 2000 and kv 400, of the file.
+    assert "servos follow slowly" in printed and "time constant of 0.2 s, which are 20" in printed
+    assert "warning: the file says no limits of velocity and acceleration" in printed
+    # Another arm with as many joints is none of them.
+    (tmp_path / "arm.xml").write_text(ARM)
+    adopt_command.main(
+        [str(tmp_path / "arm.xml"), "--site", "tool", "--out", str(tmp_path / "arm.yaml")]
+    )
+    printed = capsys.readouterr().out
+    assert "this is a" not in printed and "follow slowly" not in printed

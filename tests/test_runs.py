@@ -108,6 +108,14 @@ def test_the_newest_run_is_introduced(runs: Path, name: Path | None, capsys) -> 
     ]
 
 
+def test_the_arm_of_the_newest_run_is_named(runs: Path, capsys) -> None:
+    """The runs of all arms lie in the task's folder."""
+    package = "package:some_arms/panda/robot.xml"
+    (runs / "2026-01-02" / "config.yaml").write_text(f"env: {{mjcf: '{package}'}}")
+    choose_checkpoint(None, runs)
+    assert "2026-01-02 of the arm in panda/robot.xml (0 of 4" in capsys.readouterr().out
+
+
 def test_latest_is_a_name_for_every_command(runs: Path, monkeypatch) -> None:
     monkeypatch.chdir(runs)
     assert run_or_newest(Path("latest"), runs) == run_or_newest(None, runs) == runs / "2026-01-02"

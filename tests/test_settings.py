@@ -21,11 +21,11 @@ from bounce_mjx.config.user_code import import_code
 from bounce_mjx.errors import UserError
 from bounce_mjx.runs import presets
 from bounce_mjx.runs.config import TrainConfig, load_run_config
-from bounce_mjx.runs.folders import create_run, pretrained_checkpoint
+from bounce_mjx.runs.folders import create_run, find_checkpoint
 from bounce_mjx.runs.layers import Choice, read_layers, read_preset
 from bounce_mjx.training import job
 from bounce_mjx.training.command import read_command
-from bounce_mjx.training.run import notes_on_intervals, notes_on_starts, notes_on_worlds
+from bounce_mjx.training.run import notes_on_intervals, notes_on_learning_rate, notes_on_worlds
 from test_keys import KEYS, NEEDED, WITH, other, settings
 
 OWN = """
@@ -188,7 +188,7 @@ def test_a_default_that_an_algorithm_makes_or_leaves_out_is_a_default(folder: Pa
 
 def test_a_warm_start_is_alike_in_a_file(folder: Path) -> None:
     """It brings the environment too, and what the file says lies on it."""
-    own = load_run_config(pretrained_checkpoint("robust_small").run)
+    own = load_run_config(find_checkpoint("robust_small").run)
     (folder / "warm.yaml").write_text("warm_start: robust_small\nenv: {action_scale: 0.03}")
     with pytest.raises(
         UserError, match="warm.yaml starts from robust_small; give --warm-start rob"
@@ -209,7 +209,7 @@ def test_a_warm_start_is_alike_in_a_file(folder: Path) -> None:
 
 def test_what_is_brought_whole_has_no_part_of_a_mapping_below() -> None:
     """The environment of a policy, a whole config, and a group that Python gives."""
-    own = load_run_config(pretrained_checkpoint("robust_small").run)
+    own = load_run_config(find_checkpoint("robust_small").run)
     transfer = read_preset(Path("transfer"))
     config = read_command("--config transfer --warm-start robust_small".split()).config
     assert config.env == own.env
@@ -256,12 +256,12 @@ def test_a_file_has_the_same_defaults_wherever_it_lies(folder: Path, monkeypatch
 
 def test_a_learning_rate_that_adapts_is_said_to_be_the_first_one() -> None:
     adapts = read_layers(Choice()).config({"learning_rate": 1e-3, "target_kl": 0.01})
-    (note,) = notes_on_starts(adapts)
+    (note,) = notes_on_learning_rate(adapts)
     assert note.startswith(
         "ppo.learning_rate 0.001 is only the first one, since ppo.target_kl 0.01"
     )
     for said in ({"learning_rate": 1e-3, "target_kl": 0.0}, {"target_kl": 0.01}):
-        assert not notes_on_starts(read_layers(Choice()).config(said))
+        assert not notes_on_learning_rate(read_layers(Choice()).config(said))
 
 
 def test_a_world_that_most_episodes_do_not_have_is_said(folder: Path) -> None:
@@ -375,7 +375,7 @@ def test_a_config_that_disagrees_with_itself_is_refused(folder: Path) -> None:
     """It would train PPO with the settings of another algorithm, or a task with another's."""
     (folder / "own.py").write_text(OWN)
     import_code("own.py")
-    ppo = read_layers(Choice(algorithm="own")).start.algorithm()
+    ppo = read_layers(Choice(algorithm="own")).start.algorithm_config()
     whole = TrainConfig(algorithm="own", ppo=ppo)
     assert python(config=whole).ppo == ppo
     for algorithm, settings_of_other in (("ppo", ppo), ("own", TrainConfig().ppo)):
@@ -410,7 +410,7 @@ def test_a_run_of_another_algorithm_is_refused_as_such(folder: Path, refused) ->
 
 def test_the_printed_config_is_a_config_where_a_run_is_chosen(folder: Path, capsys) -> None:
     """What latest stands for is said as a training begins, and not in the config."""
-    policy = pretrained_checkpoint("robust_small")
+    policy = find_checkpoint("robust_small")
     shutil.copytree(policy.run, folder / "runs/2026-01-01")
     line = "--warm-start latest --log-dir runs".split()
     main(["train", *line, "--print-config"])

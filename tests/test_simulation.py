@@ -16,7 +16,7 @@ from bounce_mjx.learning.policy import make_networks
 from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.checkpoints import read_policy
 from bounce_mjx.runs.config import load_run_config
-from bounce_mjx.runs.folders import pretrained_checkpoint
+from bounce_mjx.runs.folders import find_checkpoint
 from bounce_mjx.task.bounce import Config as BounceConfig
 from bounce_mjx.task.bounce_rewards import Rewards
 from bounce_mjx.viewers import page, show
@@ -181,7 +181,7 @@ def test_another_model_has_no_slider_for_a_restitution() -> None:
 @pytest.mark.slow
 def test_a_moved_slider_changes_the_world_at_once(monkeypatch) -> None:
     """Of the nominal policy, in worlds whose ball mass is drawn."""
-    checkpoint = pretrained_checkpoint()
+    checkpoint = find_checkpoint("pretrained")
     run = load_run_config(checkpoint.run)
     config = run.env.model_copy(
         update={"randomization": RandomizationConfig(ball_mass=(0.8, 0.95))}

@@ -784,13 +784,13 @@ def test_libraries_take_another_task() -> None:
 
     import bounce_mjx.adapters.brax  # noqa: F401
     from bounce_mjx import environment
-    from bounce_mjx.adapters.gymnax_env import GymnaxBounceBall
+    from bounce_mjx.adapters.gymnax_env import GymnaxTaskEnv
 
     import_code(DRIBBLE)
     key, size = jax.random.PRNGKey(0), find_task("dribble").Config().layout.size
     env = brax.envs.get_environment("bounce_ball", task="dribble")
     assert jax.eval_shape(env.reset, key).obs.shape == (size,)
-    env = GymnaxBounceBall(environment("dribble"))
+    env = GymnaxTaskEnv(environment("dribble"))
     assert jax.eval_shape(env.reset, key, env.default_params)[0].shape == (size,)
 
 

@@ -24,7 +24,7 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.interrupt import Interrupted
 from bounce_mjx.runs.checkpoints import read_policy
 from bounce_mjx.runs.config import load_run_config
-from bounce_mjx.runs.folders import pretrained_checkpoint
+from bounce_mjx.runs.folders import find_checkpoint
 from bounce_mjx.training.events import Event
 from bounce_mjx.training.video import EvaluationVideo
 from bounce_mjx.viewers import browser, offscreen, show, video
@@ -107,7 +107,7 @@ def read_video(path: Path) -> tuple[float, np.ndarray]:
 @pytest.mark.slow
 def test_evaluations_are_filmed_for_tensorboard(opengl, tmp_path: Path) -> None:
     """Each evaluated policy is a GIF of the reset and what follows; a block is none."""
-    checkpoint = pretrained_checkpoint()
+    checkpoint = find_checkpoint("pretrained")
     config = load_run_config(checkpoint.run)
     policy = read_policy(checkpoint, config)
     blind = jax.tree.map(np.zeros_like, policy)
@@ -236,7 +236,7 @@ def test_policies_given_together_are_named_and_have_one_world(monkeypatch) -> No
     assert start.names == ["A", "A", "B", "B"] and start.num_shown == both.num_envs == 4
     assert re.fullmatch(r"A: pretrained, .* steps, B: robust, .* steps", start.title)
     for simulation, name in zip((both, *both.others), ("pretrained", "robust"), strict=True):
-        observation = load_run_config(pretrained_checkpoint(name).run).env.observation
+        observation = load_run_config(find_checkpoint(name).run).env.observation
         assert simulation.env.config.observation == observation
 
 

@@ -25,7 +25,7 @@ from bounce_mjx.runs.checkpoints import (
     save_checkpoint,
 )
 from bounce_mjx.runs.config import load_run_config
-from bounce_mjx.runs.folders import best_checkpoint, create_run, pretrained_checkpoint
+from bounce_mjx.runs.folders import best_checkpoint, create_run, find_checkpoint
 from tiny_runs import STEPS, TINY
 
 CRITIC = {"n_bounces", "world/restitution", "world/air_drag"}
@@ -110,7 +110,7 @@ def test_the_small_robust_policy_can_be_trained_further() -> None:
     assert str(command.warm_start) == "robust_small"
     assert command.env.randomization.terms and command.env.randomization.share == 1.0
     params, _ = read_start(command, Env(command.env))
-    checkpoint = pretrained_checkpoint("robust_small")
+    checkpoint = find_checkpoint("robust_small")
     own = read_policy(checkpoint, load_run_config(checkpoint.run))
     jax.tree.map(np.testing.assert_array_equal, params.policy, own.params)
 
@@ -148,7 +148,7 @@ def test_the_latest_run_is_that_beside_the_new_one_or_else_of_the_task(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     run = tmp_path / "runs/bounce_ball/2026-01-01_00-00-00"
-    shutil.copytree(pretrained_checkpoint("robust_small").run, run)
+    shutil.copytree(find_checkpoint("robust_small").run, run)
     config = train_command.read_command("--warm-start latest --log-dir new".split()).config
     assert config.warm_start == best_checkpoint(run).folder
     assert config.log_dir == Path("new")

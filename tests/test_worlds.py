@@ -19,14 +19,13 @@ from bounce_mjx.evaluation.suite import load_suite
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.config import LimitsConfig, RobotConfig
 from bounce_mjx.robot.model import add_balls, scene_spec
-from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.runs.layers import read_preset
+from bounce_mjx.runs.config import TrainConfig, load_run_config
+from bounce_mjx.runs.folders import find_checkpoint
+from bounce_mjx.runs.layers import Choice, read_layers, read_preset
 from bounce_mjx.runs.worlds import (
-    env_of_task,
-    in_named_world,
-    in_sampled_world,
+    env_in_world,
+    read_named_world,
     robot_in_world,
-    trained_in,
 )
 from bounce_mjx.task.bounce import Bounce
 from bounce_mjx.task.catch import Catch
@@ -119,7 +118,8 @@ def test_a_world_with_ranges_of_axes_trains_and_is_doubled(tmp_path: Path) -> No
     given = read_command(["--world", str(world), "--randomization.paddle-tilt", "-0.1", "0.1"])
     assert given.config.env.randomization.paddle_tilt == (-0.1, 0.1)
     trained = TrainConfig()
-    there, named = in_named_world(trained.env, world)
+    there = env_in_world(trained.env, world)
+    _, named = read_named_world(world)
     conditions = load_suite(
         resource_path("configs/robustness.yaml"),
         there,
@@ -134,7 +134,8 @@ def test_a_world_with_ranges_of_axes_trains_and_is_doubled(tmp_path: Path) -> No
 
 def test_assumed_numbers_are_doubled_entry_by_entry() -> None:
     """As `bounce-mjx robustness --world` doubles them: about the model's value of each entry."""
-    there, named = in_named_world(TrainConfig().env, Path("fast_servo"))
+    there = env_in_world(TrainConfig().env, Path("fast_servo"))
+    _, named = read_named_world(Path("fast_servo"))
     nominals = model_nominals(there)
     doubled = named.double_assumed(nominals)
     assert doubled.keys() == {f"twice {key}" for key in named.assumed}
@@ -223,14 +224,32 @@ def test_a_robots_own_balls_and_stiff_contact_are_taken_by_another_task(tmp_path
 
 def test_a_policy_is_measured_in_the_world_alone() -> None:
     trained = read_preset(Path("transfer"))
-    there, named = in_named_world(trained.env, Path("fast_servo"))
+    there = env_in_world(trained.env, Path("fast_servo"))
+    _, named = read_named_world(Path("fast_servo"))
     drawn = there.randomization
     assert set(drawn.terms) == set(named.settings["randomization"])
     assert drawn.share == 1.0 and drawn.camera_rate == (150.0, 203.0)
     assert there.observation == trained.env.observation
     assert there.action_scale == trained.env.action_scale
     with pytest.raises(UserError, match="fast_servo"):
-        in_named_world(trained.env, Path("ur5e_rtde"))
+        env_in_world(trained.env, Path("ur5e_rtde"))
+
+
+def test_a_warm_start_is_in_the_world_in_which_its_policy_is_measured() -> None:
+    """One function says what a policy's environment is in a world, for a training too."""
+    trained = load_run_config(find_checkpoint("robust_small").run).env
+    for world in (None, "fast_servo"):
+        choice = Choice(start="robust_small", world=None if world is None else Path(world))
+        begun = read_layers(choice, resource_path("configs/cpu.yaml")).config().env
+        assert begun == env_in_world(trained, world)
+
+
+def test_a_robots_file_is_of_no_other_algorithm_or_warm_start(tmp_path: Path) -> None:
+    for key, value in {"warm_start": "robust_small", "algorithm": "sac"}.items():
+        robot = tmp_path / f"{key}.yaml"
+        robot.write_text(yaml.safe_dump({key: value, "env": {}}), encoding="utf-8")
+        with pytest.raises(UserError, match=f"the robot .*{key}.yaml .*{value}"):
+            read_command(["--config", "cpu", "--robot", str(robot)])
 
 
 def test_a_world_of_a_robot_brings_its_limits_to_a_policy() -> None:
@@ -238,24 +257,24 @@ def test_a_world_of_a_robot_brings_its_limits_to_a_policy() -> None:
     own = trained.env.robot.limits
     free = {"robot": trained.env.robot.model_copy(update={"limits": LimitsConfig()})}
     config = trained.model_copy(update={"env": trained.env.model_copy(update=free)})
-    there, _ = in_named_world(config.env, Path("ur5e_rtde"))
+    there = env_in_world(config.env, Path("ur5e_rtde"))
     assert own.velocity is not None and there.robot.limits == own
     assert there.action_scale == trained.env.action_scale
     assert there.randomization.action_latency == (0.015, 0.045)
     measured = free | {"action": ActionConfig(base="measured")}
     config = trained.model_copy(update={"env": trained.env.model_copy(update=measured)})
     with pytest.raises(UserError, match="ur5e_rtde.*action.base"):
-        in_named_world(config.env, Path("ur5e_rtde"))
+        env_in_world(config.env, Path("ur5e_rtde"))
 
 
 def test_a_named_world_is_for_a_ball_on_the_paddle_too() -> None:
     """How well a person drops a ball is nothing to one that lies on the paddle."""
     for task, ball_start in (("balance", None), ("catch", (-0.03, 0.03))):
-        config = env_of_task(find_task(task), world="fast_servo")
+        config = env_in_world(find_task(task), "fast_servo")
         Env(config)
         assert config.randomization.ball_start == ball_start
         assert config.randomization.action_latency is not None
-        trained = trained_in(find_task(task).Config(), "fast_servo")
+        trained = env_in_world(find_task(task).Config(), "fast_servo")
         assert trained.randomization.ball_start == ball_start
 
 
@@ -271,9 +290,9 @@ def test_how_often_a_task_samples_its_goals_is_no_part_of_a_world() -> None:
     trained = _Moving.Config(randomization={"goal_interval": (3.0, 3.0), "air_drag": (0.0, 0.1)})
     drag = RandomizationConfig(air_drag=(0.1, 0.1))
     others = [
-        trained_in(trained, "nominal"),
-        trained_in(trained, "fast_servo"),
-        in_sampled_world(trained, drag),
+        env_in_world(trained, "nominal"),
+        env_in_world(trained, "fast_servo"),
+        env_in_world(trained, drag),
         environment_config(trained, "nominal"),
         setup_of(trained, EvaluationOptions(nominal=True)).env.config,
     ]
@@ -284,7 +303,7 @@ def test_how_often_a_task_samples_its_goals_is_no_part_of_a_world() -> None:
     assert others[1].randomization.action_latency and not others[0].randomization.air_drag
     # The user's own interval of a training is no part of the task, as its ranges are not.
     bounce = Bounce.Config(randomization={"goal_interval": (3.0, 3.0)})
-    assert trained_in(bounce, "nominal").randomization.goal_interval is None
+    assert env_in_world(bounce, "nominal").randomization.goal_interval is None
     # One value for all goals leaves nothing to sample again.
     fixed = EvaluationOptions(nominal=True, goals={"target_height": 0.5})
     assert setup_of(trained, fixed).env.config.randomization.goal_interval is None

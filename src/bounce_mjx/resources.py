@@ -39,3 +39,9 @@ def policy_folder(name: str | os.PathLike | None) -> Path | None:
     if os.path.isdir(name) and not os.path.samefile(name, folder):
         return None
     return folder
+
+
+def policy_path(policy: str | os.PathLike) -> Path:
+    """The path of a policy that a user names: that of one of the package, unless there is a folder
+    of its name."""
+    return policy_folder(policy) or Path(policy)

@@ -1,1 +1,15 @@
-"""The environment with the interfaces of other libraries."""
+"""The environment with the interfaces of other libraries. Each wraps one `Env`, its `core`:
+
+| library | class | in |
+|---|---|---|
+| Gymnasium | `TaskEnv`, `TaskVectorEnv` | `gymnasium/environments.py` |
+| Stable-Baselines3, SBX | `Sb3VecEnv`, around a `TaskVectorEnv` | `sb3.py` |
+| PyTorch | `TorchVectorEnv` | `torch/vector_env.py` |
+| rsl_rl | `RslRlVecEnv`, around a `TorchVectorEnv` | `torch/rsl_rl_env.py` |
+| skrl | `SkrlEnv`, around a `TorchVectorEnv` | `torch/skrl_env.py` |
+| brax, and TorchRL through it | `BraxTaskEnv` | `brax/environment.py` |
+| MuJoCo Playground | `PlaygroundTaskEnv` | `playground/environment.py` |
+| gymnax, PureJaxRL | `GymnaxTaskEnv`, `PureJaxRLTaskEnv` | `gymnax_env.py` |
+
+What belongs to a library that need not be installed is imported from its own file.
+"""

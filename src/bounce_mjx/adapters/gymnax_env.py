@@ -33,7 +33,7 @@ class EnvState:
     """Control steps since the reset [], int32."""
 
 
-class GymnaxBounceBall:
+class GymnaxTaskEnv:
     """One environment in the form of gymnax 1.x; an ended episode is reset within the step."""
 
     name = "BounceBall"
@@ -46,20 +46,20 @@ class GymnaxBounceBall:
           UserError: it has a warm-up.
         """
         refuse_warmup(env.config, self.name)
-        self.task = env
-        """The environment; its own `task` is the task."""
-        self.default_params = EnvParams(self.task.config.episode_steps)
+        self.core = env
+        """The `Env` in it."""
+        self.default_params = EnvParams(self.core.config.episode_steps)
         """The time limit of the settings."""
-        self.num_actions = self.task.action_size
+        self.num_actions = self.core.action_size
         """Length of the action vector."""
 
     def action_space(self, params: EnvParams | None = None) -> Any:
         """The space of the actions."""
-        return _box(1.0, self.task.action_size)
+        return _box(1.0, self.core.action_size)
 
     def observation_space(self, params: EnvParams | None = None) -> Any:
         """The space of the observations, which has no limits."""
-        return _box(jnp.inf, self.task.observation_size)
+        return _box(jnp.inf, self.core.observation_size)
 
     @functools.partial(jax.jit, static_argnames="self")
     def reset(self, key: jax.Array, params: EnvParams | None = None) -> tuple[jax.Array, EnvState]:
@@ -90,7 +90,7 @@ class GymnaxBounceBall:
           `final_observation` [N] before any reset, and the metrics of the step.
         """
         limit = (params or self.default_params).max_steps_in_episode
-        stepped = self.task.step(state.env, action)
+        stepped = self.core.step(state.env, action)
         time = state.time + 1
         terminated = stepped.done > 0
         # Never both, as in `env/vector.py`; gymnax's own environments may say both.
@@ -109,10 +109,10 @@ class GymnaxBounceBall:
 
     def _start(self, key: jax.Array) -> EnvState:
         # Apart from `reset`, which gymnax's GymnaxToVectorGymWrapper replaces.
-        return EnvState(self.task.reset(key), jnp.zeros((), jnp.int32))
+        return EnvState(self.core.reset(key), jnp.zeros((), jnp.int32))
 
 
-class PureJaxRLBounceBall(GymnaxBounceBall):
+class PureJaxRLTaskEnv(GymnaxTaskEnv):
     """The same in the form of gymnax before 1.0, for which PureJaxRL is written."""
 
     def step(
@@ -122,7 +122,7 @@ class PureJaxRLBounceBall(GymnaxBounceBall):
         action: jax.Array,
         params: EnvParams | None = None,
     ) -> tuple[jax.Array, EnvState, jax.Array, jax.Array, dict[str, Any]]:
-        """As in `GymnaxBounceBall`, but with one `done` [] for both ends. The info has only
+        """As in `GymnaxTaskEnv`, but with one `done` [] for both ends. The info has only
         `terminated` and `truncated`, because PureJaxRL keeps that of every step of a training."""
         observation, state, reward, terminated, truncated, _ = super().step(
             key, state, action, params

@@ -144,15 +144,15 @@ def parameters_of(base: Any, model: Any) -> PhysicsParameters:
     return PhysicsParameters(entries=entries or None)
 
 
-def randomized_task(task: Env, base: Any, model: Any) -> Env:
+def randomized_env(env: Env, base: Any, model: Any) -> Env:
     """The environment in the physics of a randomised model; itself if the model changes nothing.
 
     The models and the errors are those of `parameters_of`.
     """
     parameters = parameters_of(base, model)
     if parameters == MODEL_PARAMETERS:
-        return task
-    return Env(task.config, randomize=lambda key: parameters)
+        return env
+    return Env(env.config, randomize=lambda key: parameters)
 
 
 def _fields_of(model: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:

@@ -55,7 +55,7 @@ class Sb3VecEnv(VecEnv):
     def _batch(self) -> Batch:
         return self._envs._batch
 
-    task = TaskEnv.task
+    core = TaskEnv.core
     mj_model = TaskEnv.mj_model
     dt = TaskEnv.dt
     episode_steps = TaskEnv.episode_steps

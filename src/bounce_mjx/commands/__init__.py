@@ -1,1 +1,2 @@
-"""The commands, one per file."""
+"""The commands of `bounce-mjx`, a file for each name in `main.COMMANDS`; and what several share:
+the policy (`which_policy.py`) and the goals (`goals.py`)."""

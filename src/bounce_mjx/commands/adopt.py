@@ -2,7 +2,7 @@
 
 import math
 import shlex
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,23 +12,30 @@ from bounce_mjx.config.command_line import Flag, parse
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.config.user_code import import_flags
 from bounce_mjx.config.validation import validate
+from bounce_mjx.errors import UserError
+from bounce_mjx.resources import ARM_POLICIES, resource_path
 from bounce_mjx.robot.config import PaddleConfig, RobotConfig
 from bounce_mjx.runs.config import TrainConfig
+from bounce_mjx.runs.presets import ROBOTS
 from bounce_mjx.task.registry import DEFAULT, find_task
 from bounce_mjx.task.task import Task
 from bounce_mjx.world.config import WorldConfig
 
 if TYPE_CHECKING:
+    import mujoco
     import numpy as np
 
     from bounce_mjx.robot.adopt import Adoption
+
+# Servos that `adopt` makes have a time constant of two control steps; slower ones are told.
+_SLOW_STEPS = 2.5
 
 
 class AdoptCommand(StrictModel):
     """Finds the start pose and the servos of an arm, and writes its config."""
 
     mjcf: Annotated[Path, Flag(metavar="MJCF", is_positional=True)]
-    """MJCF file of the arm; package:NAME/FILE for a file of an installed Python package, or
+    """MJCF or URDF file of the arm; package:NAME/FILE for a file of an installed Python package, or
     menagerie:NAME for a model of MuJoCo Menagerie."""
     site: str = "attachment_site"
     """Site or body that holds the paddle; its z points away from the arm."""
@@ -62,6 +69,8 @@ def main(args: Sequence[str]) -> None:
     env = Env(config.env)
     for line in describe(adoption):
         print(line)
+    for line in warnings(adoption, env.mj_model, config.env):
+        print(f"warning: {line}")
     print(f"physics: {env.engine.name} ({env.engine.reason})")
     # Of menagerie:NAME, the name.
     out = command.out or Path(f"{command.mjcf.stem.rpartition(':')[2]}.yaml")
@@ -74,7 +83,65 @@ def main(args: Sequence[str]) -> None:
         viewed = ["--task", command.task, *flags]
         trained = [command.task, *flags]
     print(f"see it: bounce-mjx view {shlex.join(viewed)} --actions zero")
+    print(f"rehearse its first motions: bounce-mjx rehearse {out}")
     print(f"train it: bounce-mjx train {shlex.join(trained)}")
+
+
+def warnings(adoption: "Adoption", model: "mujoco.MjModel", config: WorldConfig) -> Iterator[str]:
+    """Sentences about what a simulation of an adopted arm lacks to be that of a real one.
+
+    Args:
+      model: the compiled scene.
+      config: that is written.
+    """
+    import numpy as np
+
+    name = known_arm(model, config)
+    if name is not None:
+        policy = f", and bounce-mjx play {name} a policy" if name in ARM_POLICIES else ""
+        yield (
+            f"this is a {name}: --robot {name} has its manufacturer's limits and servos like the "
+            f"real ones{policy}; what is written here has neither"
+        )
+    slow = []
+    for joint, servo in zip(adoption.arm.joint_names, adoption.servos, strict=True):
+        damping = servo.damping + float(np.max(model.joint(joint).damping))
+        seconds = damping / servo.stiffness
+        if seconds > _SLOW_STEPS * config.control_dt:
+            slow.append((seconds, joint))
+    if slow:
+        seconds, joint = max(slow)
+        yield (
+            f"{len(slow)} of the file's servos follow slowly, {joint} with a time constant of "
+            f"{seconds:.2g} s, which are {seconds / config.control_dt:.0f} control steps; if the "
+            "real ones are faster, give theirs as env.robot.servo_stiffness, servo_damping and "
+            "servo_force_limit"
+        )
+    yield (
+        "the file says no limits of velocity and acceleration, and a target may jump by "
+        f"{adoption.action_scale:g} rad in a control step; before a real arm, give the "
+        "manufacturer's as env.robot.limits, with env.action.base: target"
+    )
+
+
+def known_arm(model: "mujoco.MjModel", config: WorldConfig) -> str | None:
+    """The name in configs/robots/ of an arm with the same lengths and axes; None if there is none,
+    or the package with its file is not installed."""
+    from bounce_mjx.robot.likeness import are_alike
+    from bounce_mjx.runs.worlds import env_of_task
+    from bounce_mjx.world.model import world_model
+
+    for file in sorted(resource_path(ROBOTS).glob("*.yaml")):
+        try:
+            known = env_of_task(config.task, file)
+            if known.num_joints == config.num_joints and are_alike(
+                world_model(known, visual=False), model
+            ):
+                return file.stem
+        except UserError:
+            # Its file is in a package that is not installed.
+            continue
+    return None
 
 
 def _settings(command: AdoptCommand, adoption: "Adoption", task: type[Task]) -> dict[str, Any]:

@@ -12,8 +12,8 @@ from bounce_mjx.commands.which_policy import (
     OtherRandomization,
     OtherWorld,
     WhichPolicy,
-    check_one_world,
     film_command,
+    world_of_flags,
 )
 from bounce_mjx.config.command_line import Flag, stdout
 from bounce_mjx.config.settings import Count, NonNegativeInt
@@ -88,10 +88,10 @@ def main(args: Sequence[str]) -> None:
 
     check_output(command.json_file, "--json")
     console = stdout()
-    check_one_world(command.nominal, command.world, command.randomization)
+    world = world_of_flags(command.nominal, command.world, command.randomization)
     command.check_log_dir(command.checkpoint)
     checkpoint = command.choose(command.checkpoint, command.robot)
-    config = command.config_of(checkpoint, command.robot, command.world, command.randomization)
+    config = command.config_of(checkpoint, command.robot, world)
     if command.limits and config.env.robot.limits.velocity is None:
         raise UserError("the policy's arm has no command limits (env.robot.limits); omit --limits")
     trained = command.config_of(checkpoint, command.robot)

@@ -11,8 +11,8 @@ from bounce_mjx.commands.which_policy import (
     OtherRandomization,
     OtherWorld,
     WhichPolicy,
-    check_one_world,
     suite_conditions,
+    world_of_flags,
 )
 from bounce_mjx.config.command_line import Flag, stdout
 from bounce_mjx.config.settings import Count, NonNegativeInt
@@ -24,12 +24,12 @@ from bounce_mjx.evaluation.config import (
     EvaluationOptions,
 )
 from bounce_mjx.runs.config import TrainConfig
+from bounce_mjx.runs.worlds import AS_TRAINED
 from bounce_mjx.viewers.options import MAX_ENVS, ViewerOptions
 from bounce_mjx.world.randomization import RandomizationConfig
 
 if TYPE_CHECKING:
     from bounce_mjx.evaluation.policy_evaluation import InEvaluation
-    from bounce_mjx.runs.folders import Checkpoint
 
 
 class PlayCommand(WhichPolicy):
@@ -66,7 +66,10 @@ def main(args: Sequence[str]) -> None:
     if len(command.checkpoints) > MAX_ENVS:
         raise UserError(f"{len(command.checkpoints)} policies are given; give at most {MAX_ENVS}")
     command.check_log_dir(*command.checkpoints or (None,))
-    check_one_world(command.nominal, command.world, command.randomization)
+    world = world_of_flags(command.nominal, command.world, command.randomization)
+    if command.condition is not None:
+        # The suite changes the named world, or that of the training.
+        world = AS_TRAINED
     if "suite" in command.model_fields_set and command.condition is None:
         raise UserError("--suite is that of a condition; add --condition, or omit --suite")
     if command.episode is None:
@@ -88,7 +91,7 @@ def main(args: Sequence[str]) -> None:
     from bounce_mjx.viewers.simulation import make_policy_controller
 
     chosen = [command.choose(path, command.robot) for path in command.checkpoints or (None,)]
-    configs = [_config(checkpoint, command) for checkpoint in chosen]
+    configs = [command.config_of(checkpoint, command.robot, world) for checkpoint in chosen]
     # All are of one task, which `show` checks, and so have the same goals.
     for config in configs:
         goals = given_goals.checked(config.env)
@@ -108,12 +111,6 @@ def main(args: Sequence[str]) -> None:
             film = film_player(find, actor, policy, _evaluation_seed(command))
         shown.append(Shown(config.env, make_controller, title, policy, film))
     show(shown, command.viewing, goals=goals, console=stdout())
-
-
-def _config(checkpoint: "Checkpoint", command: PlayCommand) -> TrainConfig:
-    """The config of a checkpoint's training, with the world that is to be shown."""
-    world = None if command.condition else command.world
-    return command.config_of(checkpoint, command.robot, world, command.randomization)
 
 
 def _evaluation_seed(command: PlayCommand) -> int:

@@ -8,6 +8,7 @@ from pydantic import Field
 
 from bounce_mjx.commands.which_policy import WhichPolicy
 from bounce_mjx.config.command_line import Flag, parse
+from bounce_mjx.runs.config import load_run_config
 
 
 class PlotCommand(WhichPolicy):
@@ -33,8 +34,7 @@ def main(args: Sequence[str]) -> None:
     runs = [command.choose_run(run) for run in command.runs or (None,)]
     seeds = [seed for run in runs for seed in runs_of_seeds(run)]
     checkpoints = [find_checkpoint(seed) for seed in seeds]
-    # Also imports the files of the tasks, which may register plots.
-    configs = [command.config_of_run(checkpoint.run) for checkpoint in checkpoints]
+    configs = [load_run_config(checkpoint.run) for checkpoint in checkpoints]
 
     # These take seconds, which a mistake in the words above should not.
     from bounce_mjx.env.env import Env

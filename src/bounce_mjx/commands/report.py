@@ -7,6 +7,7 @@ from typing import Annotated
 from bounce_mjx.commands.which_policy import WhichPolicy
 from bounce_mjx.config.command_line import Flag, parse
 from bounce_mjx.errors import UserError
+from bounce_mjx.runs.config import load_run_config
 
 
 class ReportCommand(WhichPolicy):
@@ -27,7 +28,7 @@ def main(args: Sequence[str]) -> None:
     # With several seeds, that of the best one lies below the run.
     if checkpoint.run.absolute() in run.absolute().parents:
         raise UserError(f"a report is of a run's best checkpoint; give {checkpoint.run}, not {run}")
-    config = command.config_of_run(checkpoint.run)
+    config = load_run_config(checkpoint.run)
 
     # These take seconds, which a mistake in the words above should not.
     from bounce_mjx.reports.page import write_report

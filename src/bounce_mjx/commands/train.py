@@ -25,7 +25,7 @@ def main(args: Sequence[str]) -> None:
         config.ppo.check_rollout(config.training_episode_steps)
         config.check_eval_seed()
         remarks = dict(config.sources)
-        for key, steps in config.intervals.items():
+        for key, steps in config.rounded_steps.items():
             if steps != getattr(config, key):
                 remarks[key] += f"; in whole blocks {steps:,}"
         print(dump_with_sources(config.model_dump(mode="json"), remarks), end="")
@@ -43,7 +43,8 @@ def main(args: Sequence[str]) -> None:
     from bounce_mjx.training.job import TrainingStopped, imports_of
     from bounce_mjx.training.run import run_training
 
-    with hosts.leave_at_once(), exit_on_user_error():
+    # Within, so that a user's error is a status before the process would wait for the others.
+    with hosts.leave_without_waiting(), exit_on_user_error():
         if flags.on_several_hosts:
             # JAX must not be asked for its devices before.
             numbers = flags.num_processes, flags.process_id, flags.host_timeout

@@ -12,11 +12,10 @@ from bounce_mjx.config.command_line import Flag, plain_words
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import UserError, suggest
 from bounce_mjx.resources import policy_folder
-from bounce_mjx.runs import config as run_configs
-from bounce_mjx.runs.config import TrainConfig
+from bounce_mjx.runs.config import TrainConfig, load_run_config, runs_folder
 from bounce_mjx.runs.layers import read_preset
 from bounce_mjx.runs.presets import named_file
-from bounce_mjx.runs.worlds import in_named_world, in_sampled_world, trained_in
+from bounce_mjx.runs.worlds import AS_TRAINED, World, env_in_world, read_named_world
 from bounce_mjx.task.registry import DEFAULT, find_task
 from bounce_mjx.world.randomization import RandomizationConfig
 
@@ -62,16 +61,25 @@ OtherRandomization = Annotated[
 """Type of the flags for a what-if world."""
 
 
-def check_one_world(nominal: bool, world: Path | None, randomization: RandomizationConfig) -> None:
-    """Refuses more than one of the flags that say in which world the episodes are.
+def world_of_flags(nominal: bool, world: Path | None, randomization: RandomizationConfig) -> World:
+    """The world that a command's flags ask for; `AS_TRAINED` without one. --nominal is an option of
+    the evaluation, `EvaluationOptions.nominal`, which fixes the goals too.
 
     Raises:
-      UserError: several are given.
+      UserError: several are given, or what is given of --randomization has no term to act on.
     """
     flags = {"--nominal": nominal, "--world": world, "--randomization": randomization.terms}
     given = [flag for flag, value in flags.items() if value]
     if len(given) > 1:
         raise UserError(f"{' and '.join(given)} cannot be combined; omit one")
+    if randomization.terms:
+        return randomization
+    if randomization != RandomizationConfig():
+        raise UserError(
+            "--randomization is given without a term of the world, such as "
+            "--randomization.air-drag 0 0.2; give one, or omit it"
+        )
+    return AS_TRAINED if world is None else world
 
 
 def suite_conditions(
@@ -94,7 +102,8 @@ def suite_conditions(
     path = named_file(suite, "configs")
     if world is None:
         return path, load_suite(path, config.env), 0
-    there, named = in_named_world(config.env, world)
+    there = env_in_world(config.env, world)
+    _, named = read_named_world(world)
     assumed = named.double_assumed(model_nominals(there))
     return path, load_suite(path, config.env, there, assumed), len(assumed)
 
@@ -134,7 +143,7 @@ class WhichPolicy(StrictModel):
     @property
     def folder(self) -> Path:
         """`log_dir`, or the folder of the task's runs."""
-        return self.log_dir or run_configs.runs_folder(find_task(self.task or DEFAULT))
+        return self.log_dir or runs_folder(find_task(self.task or DEFAULT))
 
     def check_log_dir(self, *paths: Path | None) -> None:
         """Refuses a folder in which to look for the newest run where the user names every policy.
@@ -187,31 +196,17 @@ class WhichPolicy(StrictModel):
             )
         return run_or_newest(path, self.folder)
 
-    def config_of_run(self, run: Path) -> TrainConfig:
-        """The config of a run.
-
-        Raises:
-          UserError: as `load_run_config`.
-        """
-        return run_configs.load_run_config(run)
-
     def config_of(
-        self,
-        checkpoint: "Checkpoint",
-        robot: Path | None = None,
-        world: Path | None = None,
-        randomization: RandomizationConfig | None = None,
+        self, checkpoint: "Checkpoint", robot: Path | None = None, world: World = AS_TRAINED
     ) -> TrainConfig:
         """The config of a checkpoint's run, or that of the mirror law, the task's preset; with its
         environment in the world of the episodes.
 
         Args:
           robot: of the mirror law.
-          world: in place of that of the training.
-          randomization: terms of a world in place of that of the training.
 
         Raises:
-          UserError: as `load_run_config`, `read_preset`, `trained_in` and `in_sampled_world`.
+          UserError: as `load_run_config`, `read_preset` and `env_in_world`.
         """
         from bounce_mjx.baselines.mirror import observing
         from bounce_mjx.runs.folders import MIRROR_LAW
@@ -220,9 +215,6 @@ class WhichPolicy(StrictModel):
             config = read_preset(Path("default"), robot, self.task)
             env = observing(config.env)
         else:
-            config = self.config_of_run(checkpoint.run)
+            config = load_run_config(checkpoint.run)
             env = config.env
-        env = trained_in(env, world)
-        if randomization is not None:
-            env = in_sampled_world(env, randomization)
-        return config.model_copy(update={"env": env})
+        return config.model_copy(update={"env": env_in_world(env, world)})

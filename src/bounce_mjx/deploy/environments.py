@@ -1,5 +1,8 @@
-"""An environment is made once: of a task, of a policy or of a run, in a world, with settings on
-top. Every adapter takes the `Env` that `environment` gives."""
+"""An environment is made once: of a task, of a policy or of a run, in a world (`env_in_world`),
+with settings on top. Every adapter takes the `Env` that `environment` gives.
+
+It is among the exported policies because an .onnx file is a policy with its environment, too.
+"""
 
 import os
 from collections.abc import Mapping
@@ -14,11 +17,11 @@ from bounce_mjx.config.validation import validate
 from bounce_mjx.deploy.interface import check_interface, interface_of
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UnexpectedArgument, UserError, shorten, suggest
-from bounce_mjx.resources import POLICIES, policy_folder
+from bounce_mjx.resources import POLICIES, policy_path
 from bounce_mjx.robot.config import is_packaged
 from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.folders import run_of
-from bounce_mjx.runs.worlds import NOMINAL, env_of_task, trained_in
+from bounce_mjx.runs.worlds import NOMINAL, env_in_world
 from bounce_mjx.task.registry import (
     DEFAULT,
     find_task,
@@ -32,13 +35,13 @@ from bounce_mjx.world.config import WorldConfig
 
 ONNX = ".onnx"
 
-Start = str | os.PathLike | type[Task] | WorldConfig
-"""What an environment begins with: the name or the class of a task; a policy, which is the name of
+EnvironmentOf = str | os.PathLike | type[Task] | WorldConfig
+"""What an environment is made of: the name or the class of a task; a policy, which is the name of
 one of the package, a run's folder, a checkpoint in it or an .onnx file; or a whole config."""
 
 
 def environment(
-    start: Start | None = None,
+    start: EnvironmentOf | None = None,
     world: str | os.PathLike | None = None,
     *,
     policy: str | os.PathLike | None = None,
@@ -54,8 +57,8 @@ def environment(
         environment("runs/bounce_ball/2026-01-31_12-00-00", episode_seconds=60)
 
     Args:
-      start: see `Start`; by default, the task bounce. A word that is both a task and a policy, such
-        as catch, is the task.
+      start: see `EnvironmentOf`; by default, the task bounce. A word that is both a task and a
+        policy, such as catch, is the task.
       world: nominal for the model's own, which is that of a policy by default; training for the
         worlds that a policy's training sampled, without its curriculum; or a named world's file or
         name in configs/worlds/.
@@ -72,7 +75,7 @@ def environment(
 
 
 def environment_config(
-    start: Start | None = None,
+    start: EnvironmentOf | None = None,
     world: str | os.PathLike | None = None,
     *,
     policy: str | os.PathLike | None = None,
@@ -95,9 +98,9 @@ def environment_config(
     if isinstance(start, WorldConfig):
         if robot is not None:
             raise UserError("a config has its robot; leave robot out")
-        return with_settings(trained_in(start, world), settings)
+        return with_settings(env_in_world(start, world), settings)
     task = find_task(start or DEFAULT) if isinstance(start or DEFAULT, str) else start
-    return with_settings(env_of_task(task, _path(robot), world), settings)
+    return with_settings(env_in_world(task, world, _path(robot)), settings)
 
 
 def with_settings(config: WorldConfig, settings: Mapping[str, Any]) -> WorldConfig:
@@ -132,12 +135,6 @@ def refuse_warmup(config: WorldConfig, title: str) -> None:
             f"{title}: the randomisation has warmup_steps, but its ranges do not grow here; set "
             "warmup_steps to 0 and first_goal_range to 1, or train with TorchVectorEnv"
         )
-
-
-def policy_path(policy: str | os.PathLike) -> Path:
-    """The path of a policy that a user names: that of one of the package, unless there is a folder
-    of its name."""
-    return policy_folder(policy) or Path(policy)
 
 
 def _is_task_or_config(start: Any) -> bool:
@@ -185,7 +182,7 @@ def _of_policy(
             f"the policy {policy} is of the task {name_of_policy}, and the environment of the task "
             f"{name}; leave one of them out"
         )
-    config = with_settings(trained_in(trained, world or NOMINAL), settings)
+    config = with_settings(env_in_world(trained, world or NOMINAL), settings)
     check_interface(
         interface_of(trained),
         interface_of(config),

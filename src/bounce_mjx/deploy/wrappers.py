@@ -162,9 +162,9 @@ def _held(env: Any) -> list[Any]:
         return []
     attributes = getattr(env, "__dict__", {})
     held = [attributes.get(name) for name in ("env", "venv", "_env", "envs")]
-    # The adapters hold the environment as their task, some as a property.
-    task = getattr(type(env), "task", attributes.get("task"))
-    held.append(env.task if isinstance(task, property) else task)
+    # The adapters hold the environment as their core, some as a property.
+    core = getattr(type(env), "core", attributes.get("core"))
+    held.append(env.core if isinstance(core, property) else core)
     for part in held:
         if isinstance(part, list | tuple):
             return list(part)

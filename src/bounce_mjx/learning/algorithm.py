@@ -7,9 +7,9 @@ from bounce_mjx.learning.config import PPOConfig
 
 
 class Algorithm:
-    """An algorithm of the user's that is no `PPO`, such as SAC or that of another library. Once its
-    module is imported, `--algorithm NAME` trains with it: the job evaluates, saves, resumes and
-    reports as it does for PPO."""
+    """Base of every algorithm: of `PPO`, and of a user's own that is no `PPO`, such as SAC or that
+    of another library. Once its module is imported, `--algorithm NAME` trains with it: the job
+    evaluates, saves, resumes and reports as it does for PPO."""
 
     Config: ClassVar[type[PPOConfig]] = PPOConfig
     """Type of the settings: those of PPO, which describe the policy's network, and more; its

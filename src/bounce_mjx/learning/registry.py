@@ -26,5 +26,6 @@ def find_algorithm(name: str) -> type[Algorithm]:
 
 
 def own_algorithm(name: str) -> type[Algorithm] | None:
-    """The algorithm of imported code that has a name; None for that of the package."""
+    """The algorithm of imported code that has a name; None for that of the package, and where no
+    imported code has one of that name."""
     return None if name == PPO_NAME else class_of(name, Algorithm)

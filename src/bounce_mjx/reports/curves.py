@@ -190,7 +190,7 @@ def mean_and_band(curves: Sequence[LoggedCurve]) -> tuple[np.ndarray, np.ndarray
 def _label(config: TrainConfig, differences: dict[str, Any], count: int) -> str:
     """The label of a group of a number of runs of a config."""
     names = {key: key.rpartition(".")[2] for key in differences}
-    if config.starts_with_learning_rate and _LEARNING_RATE in names:
+    if config.adapts_learning_rate and _LEARNING_RATE in names:
         names[_LEARNING_RATE] = "first learning_rate"
     named = [f"{names[key]} {value}" for key, value in differences.items()]
     values = ", ".join(named[:_MAX_NAMED]) + (" …" if len(named) > _MAX_NAMED else "")

@@ -105,7 +105,7 @@ def locate(mjcf: Path) -> Path:
         path = mjcf
     if not path.is_file():
         wrong = "is not a file" if path.exists() else "does not exist"
-        raise UserError(f"the MJCF file {path} {wrong}; give the path of an MJCF file")
+        raise UserError(f"{title(path)} {wrong}; give the path of an MJCF file")
     return path
 
 
@@ -184,7 +184,9 @@ def _compiling(path: Path) -> Iterator[None]:
             yield
     except (ValueError, mujoco.FatalError) as error:
         reason = reason_of(error)
-        raise UserError(f"the MJCF file {path} does not compile ({reason}); correct it") from error
+        is_missing = "opening file" in reason
+        remedy = "put the file there" if is_missing else "correct it"
+        raise UserError(f"{title(path)} does not compile ({reason}); {remedy}") from error
     finally:
         mujoco.set_mju_user_warning(earlier)
 
@@ -197,7 +199,12 @@ def naming(path: Path) -> Iterator[None]:
     except UserError as error:
         if str(path) in str(error):
             raise
-        raise UserError(f"the MJCF file {path} has {error}") from error
+        raise UserError(f"{title(path)} has {error}") from error
+
+
+def title(path: Path) -> str:
+    """A file by its kind."""
+    return f"the {'URDF' if path.suffix.lower() == '.urdf' else 'MJCF'} file {path}"
 
 
 def find_site(model: mujoco.MjModel, config: RobotConfig) -> tuple[int, np.ndarray, np.ndarray]:
@@ -255,6 +262,7 @@ class _Builder:
         self._freeze_joints(joints, actuators)
         self._strip(joints, loose, couplings)
         self._disable_contacts(joints)
+        self._reset_idle_settings()
         self._attach(scene, holder_name, position, quaternion)
         self._replace_servos(scene, joint_names)
         return Arm(
@@ -332,8 +340,9 @@ class _Builder:
         idle = [joint_name(self._model, joint) for joint in joints if joint not in actuators]
         if idle:
             raise UserError(
-                f"no actuator on {listed(idle)}; add a <position> or <motor> with a force limit, "
-                "or name the acting joints with --joints"
+                f"no actuator on {listed(idle)}; add a <position> or <motor> with a force limit "
+                "(of a URDF, to the MJCF as which mujoco.MjSpec.from_file(FILE).to_xml() writes "
+                "it), or name the acting joints with --joints"
             )
         return actuators
 
@@ -385,6 +394,9 @@ class _Builder:
         model = self._model
         couplings = []
         for constraint, equality in enumerate(self._spec.equalities):
+            # One that is off couples nothing, and goes with what is not the arm.
+            if not model.eq_active0[constraint]:
+                continue
             couplings.append((_constraint_words(equality), _ends_of_constraint(model, constraint)))
         for tendon in range(model.ntendon):
             couplings.append((_tendon_words(model, tendon), _ends_of_tendon(model, tendon)))
@@ -587,6 +599,34 @@ class _Builder:
             self._changes.append("turned off the arm's own contacts: only ball and paddle touch")
         if np.any(self._model.jnt_limited[joints]):
             self._changes.append("made the joint limits act by clipping the servo targets")
+
+    def _reset_idle_settings(self) -> None:
+        """Gives settings of what cannot act in the scene MuJoCo's defaults, so that none of them
+        can be what an engine lacks: of contacts and limits, and of dry friction where there is
+        none."""
+        kinds = {
+            "geoms": (list(self._spec.geoms), ("solref", "solimp")),
+            "joints": (list(self._spec.joints), ("solref_limit", "solimp_limit")),
+            "joints without dry friction": (
+                [joint for joint in self._spec.joints if not joint.frictionloss],
+                ("solref_friction", "solimp_friction"),
+            ),
+        }
+        default = mujoco.MjSpec().worldbody.add_body()
+        plain_geom = default.add_geom()
+        plain_joint = default.add_joint()
+        for words, (elements, names) in kinds.items():
+            plain = plain_geom if words == "geoms" else plain_joint
+            for name in names:
+                own = np.array(getattr(plain, name))
+                changed = [x for x in elements if not np.array_equal(getattr(x, name), own)]
+                for element in changed:
+                    setattr(element, name, own)
+                if changed:
+                    attribute = name.replace("_", "")
+                    self._changes.append(
+                        f"reset the {attribute} of {words} ({len(changed)}), where it cannot act"
+                    )
 
     def _attach(
         self, scene: mujoco.MjSpec, holder: str, position: np.ndarray, quaternion: np.ndarray

@@ -21,9 +21,6 @@ PAIR_SETTINGS = "condim solref solreffriction solimp margin gap adhesion frictio
 """Attributes of a contact pair in an `MjSpec` that say how its geoms touch."""
 
 _STEPS_OF_A_CONTACT = 4
-# Fields of an MjModel with a solref or a solimp, which `{}` stands for.
-_FIELDS = "pair_{} geom_{} jnt_{} dof_{} eq_{} tendon_{}_lim tendon_{}_fri".split()
-
 # Damping ratios of the contact, and the measured restitution: the mean of the drops on the held
 # paddle of tests/test_randomization.py, at 1, 2, 3 and 4 m/s and eight phases of the physics step.
 # The last entry is not measured: it makes each ratio beyond 1.6 have a restitution of its own, from
@@ -125,14 +122,25 @@ def _half_period(solref: np.ndarray, timestep: float) -> float:
 
 def unsupported_constraints(mj_model: mujoco.MjModel) -> Iterator[tuple[str, bool]]:
     """Settings of constraints that MuJoCo takes with a warning, and that `physics.support` refuses
-    for every engine: the name of each, and whether a model has it."""
-    for field in _FIELDS:
-        solref_field = field.format("solref")
-        solimp_field = field.format("solimp")
-        is_mixed = _is_mixed(getattr(mj_model, solref_field))
-        yield f"a {solref_field} with exactly one positive number", bool(np.any(is_mixed))
-        widths = getattr(mj_model, solimp_field)[:, 2]
-        yield f"a {solimp_field} without a width", bool(np.any(widths <= mujoco.mjMINVAL))
+    for every engine: the name of each, and whether a model has it on a constraint that can act."""
+    m = mj_model
+    # Dry friction may be sampled in any joint.
+    acting = {
+        "pair_{}": ("a contact pair's {}", np.ones(m.npair, bool)),
+        "geom_{}": ("the {} of a geom that touches", (m.geom_contype | m.geom_conaffinity) != 0),
+        "jnt_{}": ("the {}limit of a joint with limits", m.jnt_limited != 0),
+        "dof_{}": ("a joint's {}friction", np.ones(m.nv, bool)),
+        "eq_{}": ("an equality's {}", m.eq_active0 != 0),
+        "tendon_{}_lim": ("the {}limit of a tendon with limits", m.tendon_limited != 0),
+        "tendon_{}_fri": ("a tendon's {}friction", m.tendon_frictionloss > 0.0),
+    }
+    for field, (words, acts) in acting.items():
+        is_mixed = _is_mixed(getattr(m, field.format("solref")))
+        mixed = f"{words.format('solref')} with exactly one positive number"
+        yield mixed, bool(np.any(is_mixed & acts))
+        widths = getattr(m, field.format("solimp"))[:, 2]
+        no_width = f"{words.format('solimp')} without a width"
+        yield no_width, bool(np.any((widths <= mujoco.mjMINVAL) & acts))
 
 
 def _is_mixed(solrefs: np.ndarray) -> np.ndarray:

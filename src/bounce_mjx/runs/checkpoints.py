@@ -1,4 +1,5 @@
-"""Checkpoints, which orbax reads and writes; one sentence refuses a damaged one.
+"""Checkpoints, which orbax reads and writes; one sentence refuses a damaged one. `records.py` has
+`Checkpoint`, where one is, and `Record`, what it says of itself; `folders.py` finds them.
 
 Arrays are numbers in OCDBT and zarr, and the rest is JSON: nothing in a checkpoint is executable.
 Every function that reads raises a `UserError` if the checkpoint is damaged or its config differs

@@ -51,7 +51,8 @@ def _default_log_dir(known: dict[str, Any]) -> Path:
 
 
 class TrainConfig(StrictModel):
-    """A training run: the task, the trainer, the length and the evaluations."""
+    """A training run: the task, the algorithm, the length and the evaluations. `task` is the task's
+    name, and `env.task` its class."""
 
     task: str = DEFAULT
     """Name of the task."""
@@ -60,7 +61,7 @@ class TrainConfig(StrictModel):
     algorithm: str = PPO_NAME
     """ppo, or the name of an imported subclass of `bounce_mjx.learning.ppo.PPO`."""
     ppo: pydantic.SerializeAsAny[PPOConfig] = PPOConfig()
-    """The trainer: the settings of the algorithm's `Config`."""
+    """The settings of the algorithm, those of its `Config`, also of one that is no PPO."""
     seed: NonNegativeInt = 0
     """Seed of the run."""
     num_seeds: Count = 1
@@ -79,7 +80,9 @@ class TrainConfig(StrictModel):
     """Environment steps between two saved states, rounded to whole blocks, in addition to those
     after each evaluation; null for these alone."""
     keep_checkpoints: Count | Literal["all"] = 1
-    """Newest checkpoints that stay, or all, in addition to the one of the best evaluation."""
+    """Newest checkpoints that stay, or all, in addition to the one of the best evaluation. Of
+    several seeds these are the run's, which hold the state of all seeds; a seed's own folder has
+    its best one."""
     eval_episodes: Count = 1024
     """Episodes of an evaluation of the results."""
     screening_episodes: NonNegativeInt = 0
@@ -145,7 +148,7 @@ class TrainConfig(StrictModel):
         return self.steps_per_block * max(1, round(steps / self.steps_per_block))
 
     @property
-    def intervals(self) -> dict[str, int]:
+    def rounded_steps(self) -> dict[str, int]:
         """The settings that are numbers of steps, by key, in the whole blocks that are trained."""
         numbers = {}
         for key in ("total_steps", "block_steps", "eval_every", "save_every"):
@@ -155,9 +158,10 @@ class TrainConfig(StrictModel):
         return numbers
 
     @property
-    def starts_with_learning_rate(self) -> bool:
-        """Whether `ppo.learning_rate` is only the start, as `target_kl` adapts it after each
-        minibatch; an algorithm of the user's may have a schedule of its own."""
+    def adapts_learning_rate(self) -> bool:
+        """Whether `target_kl` adapts the learning rate after each minibatch, so that
+        `ppo.learning_rate` is only the first one; an algorithm of the user's may have a schedule of
+        its own."""
         return self.algorithm == PPO_NAME and self.ppo.target_kl > 0.0
 
     def set_sources(self, sources: dict[str, str]) -> None:
@@ -327,7 +331,7 @@ def _sources_in(stored: Any) -> dict[str, str]:
 
 
 def code_of(run: Path, key: str) -> Path | None:
-    """A run's copy of the code of its task or its algorithm; None where a package has it.
+    """A run's copy of the code of its own task or algorithm; None where a package has it.
 
     Args:
       key: task or algorithm.

@@ -1,14 +1,15 @@
 """Folders of runs and checkpoints, and functions that find them.
 
-    runs/<task>/<time stamp, UTC>/
+    runs/<task>/<time stamp, UTC>/      <task> as in `runs_folder`: that of bounce is bounce_ball
         config.yaml                     the resolved config
         robot/                          a copy of --mjcf and its files, with a manifest
         task/, algorithm/               copies of the code of own ones
-        report.html, robustness.*, failures.png   see `reports`
         events.out.tfevents.*           TensorBoard scalars
         results.json                    all evaluations, and the time of each activity
-        checkpoints/<number>/           one for the newest state and one for the best evaluation, or
-                                        one for both
+        report.html, video/             of `train`, with --report and --video
+        robustness.*, failures.png      of the commands `robustness` and `eval --failures`
+        checkpoints/<number>/           the newest states, as many as keep_checkpoints says, and
+                                        the best evaluation
             policy/                     the policy's arrays
             training/                   the training state's arrays; optional
             networks/                   both networks, for another training; optional
@@ -21,7 +22,17 @@ A checkpoint's number is that of the steps trained; see `Checkpoint`.
 A run with several seeds has one folder per seed, such as seed_003/, with the layout of a run with
 one seed; the run's own checkpoints/ holds the state of all seeds.
 
-Functions that search raise a `UserError` if they find nothing.
+What finds them, and raises a `UserError` where there is nothing:
+
+| from | function | finds |
+|---|---|---|
+| a user's word, or none | `run_or_newest` | what the word names, or the newest run |
+| | `choose_checkpoint` | the checkpoint to show: of the word, the newest run or the package |
+| a path, or a policy's name | `run_of` | the run's folder |
+| | `find_checkpoint` | the best checkpoint there, with several seeds that of the best one |
+| a run's or a seed's own folder | `best_checkpoint`, `latest_checkpoint` | one of its own |
+| | `stored_checkpoints`, `runs_of_seeds` | all of its checkpoints or seeds |
+| a folder of runs | `runs_in` | all runs that have a checkpoint |
 """
 
 import contextlib
@@ -45,9 +56,17 @@ from bounce_mjx.resources import (
     TASK_POLICIES,
     VERSION,
     policy_folder,
+    policy_path,
     resource_path,
 )
-from bounce_mjx.runs.config import CONFIG_FILE, ROBOT, TrainConfig, dump_sources, runs_folder
+from bounce_mjx.runs.config import (
+    CONFIG_FILE,
+    ROBOT,
+    TrainConfig,
+    dump_sources,
+    load_run_config,
+    runs_folder,
+)
 from bounce_mjx.runs.presets import BASE
 from bounce_mjx.runs.progress import load_results
 from bounce_mjx.runs.records import Checkpoint, DamagedCheckpoint, Record, verify
@@ -96,8 +115,8 @@ def create_run(config: TrainConfig) -> Path:
 
 
 def save_config(run: Path, config: TrainConfig) -> None:
-    """Writes the run's resolved config, and copies of its robot and of its task's file unless the
-    run has them."""
+    """Writes the run's resolved config, and copies of its robot and of the code of its own task and
+    algorithm, unless the run has them."""
     own = {"task": own_task(config.task), "algorithm": own_algorithm(config.algorithm)}
     for key, kind in own.items():
         source = None if kind is None else source_of(kind)
@@ -248,9 +267,10 @@ def find_checkpoint(path: str | Path) -> Checkpoint:
 
     Args:
       path: a run's folder (finds its best checkpoint, or its latest if there is no best), a folder
-        of checkpoints in it, or a checkpoint.
+        of checkpoints in it, or a checkpoint; or a name in `POLICIES`, unless there is a folder
+        with that name.
     """
-    path = Path(path)
+    path = policy_path(path)
     run = run_of(path)
     if os.path.samefile(path, run):
         path = run = _best_seed(run)
@@ -343,11 +363,6 @@ def _free_name(path: str) -> Path:
     return Path(free)
 
 
-def pretrained_checkpoint(name: str = PRETRAINED) -> Checkpoint:
-    """Checkpoint of a policy in `POLICIES`."""
-    return best_checkpoint(resource_path(POLICIES[name]))
-
-
 def choose_checkpoint(
     path: Path | None, log_dir: Path, tell: Callable[[str], None] = print
 ) -> Checkpoint:
@@ -360,7 +375,7 @@ def choose_checkpoint(
       tell: gets a line about the choice if the user made none.
     """
     if policy_folder(path):
-        return pretrained_checkpoint(str(path))
+        return find_checkpoint(path)
     try:
         run = run_or_newest(path, log_dir)
     except UserError:
@@ -368,14 +383,24 @@ def choose_checkpoint(
         if path is not None or policy is None:
             raise
         tell(f"no run in {log_dir}: using the policy that comes with the package")
-        return pretrained_checkpoint(policy)
+        return find_checkpoint(resource_path(POLICIES[policy]))
     if not os.path.isdir(run) and (near := suggest(str(path), POLICIES)):
         raise UserError(f"there is no checkpoint folder and no policy {path}; {near}")
     if run != path:
         results = load_results(_best_seed(run))
         known = results.best.summary if results else "not evaluated"
-        tell(f"using the newest run: {run} ({known})")
+        tell(f"using the newest run: {run}{_arm_of(run)} ({known})")
     return find_checkpoint(run)
+
+
+def _arm_of(run: Path) -> str:
+    """The arm of a run in words, as a folder has the runs of all arms; empty for the project's own,
+    and for a run whose config cannot be read."""
+    try:
+        mjcf = load_run_config(run).env.mjcf
+    except UserError:
+        return ""
+    return "" if mjcf is None else f" of the arm in {mjcf.parent.name}/{mjcf.name}"
 
 
 def _policy_of_folder(log_dir: Path) -> str | None:

@@ -9,14 +9,14 @@ training begins with. Everything else is values. They are layers, and a later on
     4. a preset that the user names, in place of the machine's
     5. a warm start: the environment and the networks of a policy
     6. the user's files and further presets, each on those before it
-    7. --robot, or the robot of --world
+    7. --robot, or the robot of --world; its file may say something of the training, too
     8. --world
     9. what the user says: flags of the command, or arguments of `train`
 
 A resumed run has two: its own config, and what the user says; more steps end its
-`stop_when_solved` where that had ended it (`Layers._go_on`). `layers_on` reads the layers below the
-user's, each file once. `Layers.config` merges all of them and validates the result, once; the
-config then knows what set each of its values (`TrainConfig.sources`).
+`stop_when_solved` where that had ended it (`Layers._beyond_solved`). `layers_on` reads the layers
+below the user's, each file once. `Layers.config` merges all of them and validates the result, once;
+the config then knows what set each of its values (`TrainConfig.sources`).
 """
 
 import dataclasses
@@ -44,7 +44,7 @@ from bounce_mjx.runs.config import (
 )
 from bounce_mjx.runs.presets import BASE, SOURCES, preset_files, read_config_file, shown_file
 from bounce_mjx.runs.start import Start, beside_run, find_start
-from bounce_mjx.runs.worlds import robot_and_world
+from bounce_mjx.runs.worlds import layers_of_environment
 from bounce_mjx.world.named import without_idle_curriculum
 
 FLAGS = "flags"
@@ -54,7 +54,8 @@ PYTHON = "train"
 
 
 class ChoiceFlags(StrictModel):
-    """The flags of a choice."""
+    """The flags that decide which layers there are. The last three are keys of the config, too: the
+    algorithm's class, the policy of a warm start, and where latest is looked for."""
 
     config: Annotated[tuple[Path, ...], Flag(metavar="NAME|FILE", is_repeated=True)] = ()
     """Preset, such as cpu or finetune (a YAML file in configs/), or a YAML file of yours. A task's
@@ -145,22 +146,27 @@ def layers_on(
         files = _layers_of_files(found.own)
         for layer in (*named, *files):
             _check_start(layer, start)
-    changed = _changed_defaults(start.algorithm)
-    policies = [] if start.policy is None else [_layer_of_policy(start, world is not None)]
+    changed = _changed_defaults(start.algorithm_config)
     trained = None if start.policy is None else start.policy.env
-    robots, worlds = robot_and_world(robot, world, start.task, trained)
+    of_env = layers_of_environment(start.task, trained, robot, world)
+    for layer in of_env.robot:
+        _check_start(layer, start)
+    policies = [_with_networks(layer, start) for layer in of_env.policy]
     return Layers(
         start=start,
-        below=(*machines, *changed, *named, *policies, *files, *robots, *worlds),
+        below=(*machines, *changed, *named, *policies, *files, *of_env.robot, *of_env.world),
         notes=(*start.notes, *_notes(changed, named, "ppo."), *_notes(named, policies, "env.")),
     )
 
 
 def _check_start(layer: Layer, start: Start) -> None:
-    """Checks that a file, which has values alone, is of what the training begins with.
+    """Checks that a file, which has values alone, is of what the training begins with. The word
+    alone says the task. An algorithm or a warm start that the user names wins over the file's, as
+    any flag does.
 
     Raises:
-      UserError: it is of another task, algorithm or warm start.
+      UserError: it is of another task, or of an algorithm or a warm start that the user does not
+        name.
     """
     task = layer.values.get("task", start.task_name)
     algorithm = layer.values.get("algorithm", start.algorithm_name)
@@ -231,18 +237,13 @@ def _as_in_yaml(value: Any) -> Any:
     return list(map(_as_in_yaml, value)) if isinstance(value, list | tuple) else value
 
 
-def _layer_of_policy(start: Start, is_in_world: bool) -> Layer:
-    """The task, the environment and the networks of the policy of a warm start. A named world
-    replaces the randomisation."""
+def _with_networks(of_env: Layer, start: Start) -> Layer:
+    """The layer of the policy of a warm start: its environment, its task and its networks."""
     from bounce_mjx.runs.checkpoints import NETWORK_KEYS
 
-    env = start.policy.env.model_dump()
-    if is_in_world:
-        del env["randomization"]
     networks = start.policy.ppo.model_dump(include={*NETWORK_KEYS, "critic_metrics"})
-    values = {"task": start.policy.task, "env": env, "ppo": networks}
-    whole = tuple(f"env.{key}" for key in env)
-    return Layer(f"the warm start {start.warm_start}", values, whole=whole)
+    values = of_env.values | {"task": start.policy.task, "ppo": networks}
+    return of_env._replace(source=f"the warm start {start.warm_start}", values=values)
 
 
 # Merging and validating -------------------------------------------------------------------------
@@ -261,7 +262,7 @@ class Layers:
     @functools.cached_property
     def fields(self) -> dict[str, FieldInfo]:
         """The settings that there are, by dotted key."""
-        return fields_of(self.start.task.Config, self.start.algorithm)
+        return fields_of(self.start.task.Config, self.start.algorithm_config)
 
     @property
     def title(self) -> str:
@@ -286,10 +287,10 @@ class Layers:
           UserError: a key is unknown, a value is out of range, or it must be that of the resumed
             run. The error names the layer that set it.
         """
-        source = PYTHON if flags is None else FLAGS
+        user_source = PYTHON if flags is None else FLAGS
         # A start is what it was found to be, such as a checkpoint.
-        user = self._layer_of_user(source, {**(said or {}), **self.start.said})
-        above = [*self._go_on(user), user]
+        user = self._layer_of_user(user_source, {**(said or {}), **self.start.said})
+        above = [*self._beyond_solved(user), user]
         layers = [*self.below, *above]
         for layer in layers:
             self._check_groups(layer)
@@ -299,15 +300,15 @@ class Layers:
         try:
             config = self._validated(values)
         except _Mistake as mistake:
-            source = _setter_of(mistake.path, layers)
-            if flags is not None and source == FLAGS:
+            setter = _setter_of(mistake.path, layers)
+            if flags is not None and setter == FLAGS:
                 text = describe(mistake.error, self.fields, flags, mistake.group)
                 raise UserError(f"{text} (see {prog} --help)") from mistake.error
             text = describe(mistake.error, self.fields, group=mistake.group)
-            if source != PYTHON and mistake.path in (["robot"], ["world"]):
+            if setter != PYTHON and mistake.path in (["robot"], ["world"]):
                 (name,) = mistake.path
                 text = f"{name} is no setting; leave it out, and give --{name} or train({name}=...)"
-            raise UserError(f"{shorten(source)}: {text}") from mistake.error
+            raise UserError(f"{shorten(setter)}: {text}") from mistake.error
         if self.start.resumed is not None:
             _check_resumable(self.start.resumed, config)
             _, changed = _merge(above)
@@ -354,7 +355,7 @@ class Layers:
                 return full
         return key
 
-    def _go_on(self, user: Layer) -> list[Layer]:
+    def _beyond_solved(self, user: Layer) -> list[Layer]:
         """A layer for a run that has met all results, where a number of steps is asked for: it goes
         on to that number."""
         if self.start.run is None or "total_steps" not in user.values:
@@ -371,7 +372,7 @@ class Layers:
         return []
 
     def _validated(self, values: dict[str, Any]) -> TrainConfig:
-        groups = {"env": self.start.task.Config, "ppo": self.start.algorithm}
+        groups = {"env": self.start.task.Config, "ppo": self.start.algorithm_config}
         typed = dict(values)
         for name, kind in groups.items():
             try:
@@ -400,8 +401,7 @@ def _merge(layers: Sequence[Layer]) -> tuple[dict[str, Any], dict[str, str]]:
     sources: dict[str, str] = {}
     for layer in layers:
         for key in layer.whole:
-            # The layer has the key, so that the None does not remain.
-            values = merged(values, nested(key, None))
+            values = _without(values, key)
         values = merged(values, layer.values)
         if layer.is_world:
             randomization = without_idle_curriculum(values["env"]["randomization"])
@@ -413,6 +413,16 @@ def _merge(layers: Sequence[Layer]) -> tuple[dict[str, Any], dict[str, str]]:
     # A later layer may end a value, or replace a mapping by None.
     remaining = flat(values)
     return values, {key: source for key, source in sources.items() if key in remaining}
+
+
+def _without(values: dict[str, Any], key: str) -> dict[str, Any]:
+    """Nested mappings without a value or a group, by its dotted key."""
+    name, _, rest = key.partition(".")
+    if not rest:
+        return {other: value for other, value in values.items() if other != name}
+    if not isinstance(values.get(name), dict):
+        return values
+    return values | {name: _without(values[name], rest)}
 
 
 def _setter_of(path: Sequence[str], layers: Sequence[Layer]) -> str:

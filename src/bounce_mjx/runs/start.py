@@ -19,8 +19,8 @@ class Start(NamedTuple):
 
     task: type[Task]
     task_name: str
-    algorithm: type[PPOConfig]
-    """The settings of the algorithm."""
+    algorithm_config: type[PPOConfig]
+    """Type of the settings of the algorithm."""
     algorithm_name: str
     said: dict[str, Any]
     """What the user says by it, by keys of the config."""
@@ -101,7 +101,7 @@ def find_start(
     return Start(
         task=task,
         task_name=task_name(task),
-        algorithm=settings,
+        algorithm_config=settings,
         algorithm_name=algorithm_name,
         said=said,
         policy=policy,
@@ -146,7 +146,7 @@ def _start_of_run(word: Path, log_dir: Path | None) -> Start:
     return Start(
         task=config.env.task,
         task_name=config.task,
-        algorithm=type(config.ppo),
+        algorithm_config=type(config.ppo),
         algorithm_name=config.algorithm,
         said={},
         run=place,

@@ -20,8 +20,8 @@ ModelT = TypeVar("ModelT", bound=pydantic.BaseModel)
 
 
 class Manifest(pydantic.BaseModel):
-    """manifest.json: size and SHA-256 of every other file in a checkpoint, by name, but for
-    those that begin with a dot, such as a file system's own."""
+    """manifest.json: size and SHA-256 of every other file in a folder, a checkpoint or a run's copy
+    of its robot, by name, but for those that begin with a dot, such as a file system's own."""
 
     format: Literal[1] = 1
     """A later version's would mean something else."""
@@ -156,7 +156,7 @@ def check_output(path: Path | None, flag: str, suffixes: tuple[str, ...] = ()) -
 
 
 def seal(folder: Path) -> None:
-    """Writes the manifest of a checkpoint; all other files must be complete."""
+    """Writes the manifest of a folder; all other files must be complete."""
     write_atomically(folder / MANIFEST_FILE, to_json(Manifest(files=_describe_files(folder))))
 
 

@@ -1,9 +1,12 @@
-"""Robots and worlds: as layers of a training's settings, and the environment of a training in
-another world."""
+"""The environment of a task, or of a policy's training, in a world: `env_in_world`.
+
+Its settings are layers, the lowest first: what the policy was trained in, its robot, and its world
+(`layers_of_environment`). A training has further layers between them (`runs/layers.py`).
+"""
 
 import os
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from bounce_mjx.config.settings import Layer, merged
 from bounce_mjx.config.validation import validate
@@ -16,32 +19,96 @@ from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.named import CURRICULUM, NamedWorld, read_world
 from bounce_mjx.world.randomization import RandomizationConfig
 
-NOMINAL = "nominal"
-"""World: the model's own."""
+AS_TRAINED = None
+"""World: each that a policy's training sampled, as it did; a task's own."""
 TRAINING = "training"
-"""World: each that a policy's training sampled."""
+"""World: each that a policy's training sampled, without its curriculum."""
+NOMINAL = "nominal"
+"""World: the model's own; a task's own."""
+
+World = str | os.PathLike | RandomizationConfig | None
+"""`AS_TRAINED`, `TRAINING` or `NOMINAL`; the file of a named world, or its name in configs/worlds/;
+or, of a policy, the terms of a user's own."""
 
 
-def robot_and_world(
-    robot: Path | None, world: Path | None, task: type[Task], trained: WorldConfig | None
-) -> tuple[list[Layer], list[Layer]]:
-    """The layers of a robot, which may be that of the world, and of a world: none or one of each.
+class EnvironmentLayers(NamedTuple):
+    """The settings of an environment, the lowest first; each is one layer or none."""
+
+    policy: list[Layer]
+    """What the policy was trained in; in a named world, without its randomisation."""
+    robot: list[Layer]
+    """The user's robot, or that of the world."""
+    world: list[Layer]
+    """A named world."""
+
+
+def env_in_world(
+    start: type[Task] | WorldConfig, world: World, robot: Path | None = None
+) -> WorldConfig:
+    """The environment of a task, or of a policy's training with its observation and its actions, in
+    a world. Each caller says the world: a training and its measurements are `AS_TRAINED` unless the
+    user names another one; the environment that a user asks for by its policy is `NOMINAL`.
 
     Args:
+      start: a task, or the config of a policy's environment.
+      robot: of a task: a file, or a name in configs/robots/.
+
+    Raises:
+      UserError: the robot or the world is missing or wrong, the world is of another robot, a term
+        does not fit the arm, or a task has no training's worlds.
+    """
+    if isinstance(start, WorldConfig):
+        if world is AS_TRAINED:
+            return start
+        if world == NOMINAL:
+            return start.in_world(RandomizationConfig())
+        if world == TRAINING:
+            ended = {"warmup_steps": 0, "first_goal_range": 1.0}
+            randomization = start.randomization.model_copy(update=ended)
+            return start.model_copy(update={"randomization": randomization})
+        if isinstance(world, RandomizationConfig):
+            given = dict(start.in_world(world))
+            return validate(type(start), given, "the flags --randomization")
+        layers = layers_of_environment(type(start).task, start, None, Path(world))
+        return _merged(type(start), layers)
+    if world == TRAINING:
+        raise UserError(
+            f"the world {TRAINING} is that of a policy; give a policy, or a named world"
+        )
+    named = None if world in (AS_TRAINED, NOMINAL) else Path(world)
+    return _merged(start.Config, layers_of_environment(start, None, robot, named))
+
+
+def _merged(config_class: type[WorldConfig], layers: EnvironmentLayers) -> WorldConfig:
+    """The environment of layers."""
+    values: dict[str, Any] = {}
+    for layer in (*layers.policy, *layers.robot, *layers.world):
+        values = merged(values, layer.values)
+    sources = [layer.source for layer in (*layers.world, *layers.robot)]
+    source = " on ".join(sources) or config_class.__qualname__
+    return validate(config_class, values.get("env", {}), source, "env")
+
+
+def layers_of_environment(
+    task: type[Task], trained: WorldConfig | None, robot: Path | None, world: Path | None
+) -> EnvironmentLayers:
+    """The layers of an environment.
+
+    Args:
+      trained: the environment of a policy, which has its own robot.
       robot: a file, or a name in configs/robots/.
       world: a file, or a name in configs/worlds/.
-      trained: the environment of a policy that goes into the world, with its own robot.
 
     Raises:
       UserError: one of them is missing or wrong, or the world is of another robot.
     """
+    policies = [] if trained is None else [_layer_of_policy(trained, world is not None)]
     robots = []
     if robot is not None:
         robots.append(_layer_of_robot(task, named_file(robot, ROBOTS, "robot")))
     if world is None:
-        return robots, []
-    path = named_file(world, WORLDS, "world")
-    named = read_world(path)
+        return EnvironmentLayers(policies, robots, [])
+    path, named = read_named_world(world)
     if named.robot is not None:
         if robots:
             raise UserError(
@@ -51,89 +118,29 @@ def robot_and_world(
             robots.append(_layer_of_robot(task, _robot_of(named, path)))
         else:
             robots.append(_layer_of_same_robot(trained, named, path))
-    return robots, [_layer_of_world(task, named, path)]
+    return EnvironmentLayers(policies, robots, [_layer_of_world(task, named, path)])
 
 
-def env_of_task(
-    task: type[Task], robot: Path | None = None, world: str | os.PathLike | None = None
-) -> WorldConfig:
-    """The environment of a task with a robot, in a world.
+def read_named_world(world: Path) -> tuple[Path, NamedWorld]:
+    """The file of a named world, and the world.
 
     Args:
-      robot: a file, or a name in configs/robots/.
-      world: as for `trained_in`, but for that of a training.
+      world: a file, or a name in configs/worlds/.
 
     Raises:
-      UserError: one of them is missing or wrong, or the world is of another robot.
-    """
-    if world == TRAINING:
-        raise UserError(
-            f"the world {TRAINING} is that of a policy; give a policy, or a named world"
-        )
-    named = None if world in (None, NOMINAL) else Path(world)
-    robots, worlds = robot_and_world(robot, named, task, None)
-    values: dict[str, Any] = {}
-    for layer in (*robots, *worlds):
-        values = merged(values, layer.values)
-    source = " on ".join(layer.source for layer in (*worlds, *robots)) or task.__name__
-    return validate(task.Config, values.get("env", {}), source, "env")
-
-
-def trained_in(trained: WorldConfig, world: str | os.PathLike | None) -> WorldConfig:
-    """The environment of a training in a world, with the observation and the actions of its policy.
-
-    Args:
-      world: None for each world that the training sampled, as it did; training for the same without
-        its curriculum; nominal for the model's own; or a named world's file or name in
-        configs/worlds/.
-
-    Raises:
-      UserError: the world is missing or wrong, or of another robot than the training.
-    """
-    if world is None:
-        return trained
-    if world == NOMINAL:
-        return trained.in_world(RandomizationConfig())
-    if world == TRAINING:
-        ended = {"warmup_steps": 0, "first_goal_range": 1.0}
-        randomization = trained.randomization.model_copy(update=ended)
-        return trained.model_copy(update={"randomization": randomization})
-    return in_named_world(trained, Path(world))[0]
-
-
-def in_named_world(trained: WorldConfig, world: Path) -> tuple[WorldConfig, NamedWorld]:
-    """`trained_in` of a named world, and the world itself.
-
-    Raises:
-      UserError: the world is wrong, or of another robot than the training.
+      UserError: it is missing or wrong.
     """
     path = named_file(world, WORLDS, "world")
-    named = read_world(path)
-    values = trained.model_dump()
-    # The curriculum of the training goes too.
-    del values["randomization"]
-    if named.robot is not None:
-        values = merged(values, _layer_of_same_robot(trained, named, path).values["env"])
-    values = merged(values, _settings_for(type(trained).task, named))
-    return validate(type(trained), values, f"the world {shown_file(path)}", "env"), named
+    return path, read_world(path)
 
 
-def in_sampled_world(trained: WorldConfig, randomization: RandomizationConfig) -> WorldConfig:
-    """The environment of a training with the terms of the world that a user gives, if any, in place
-    of its own.
-
-    Raises:
-      UserError: a term does not fit the arm, or what is given has no term to act on.
-    """
-    if randomization.terms:
-        given = dict(trained.in_world(randomization))
-        return validate(type(trained), given, "the flags --randomization")
-    if randomization != RandomizationConfig():
-        raise UserError(
-            "--randomization is given without a term of the world, such as "
-            "--randomization.air-drag 0 0.2; give one, or omit it"
-        )
-    return trained
+def _layer_of_policy(trained: WorldConfig, is_in_world: bool) -> Layer:
+    """What a policy was trained in. A named world replaces the randomisation, with its
+    curriculum."""
+    env = trained.model_dump()
+    if is_in_world:
+        del env["randomization"]
+    return Layer("the policy", {"env": env}, whole=tuple(f"env.{key}" for key in env))
 
 
 def _layer_of_world(task: type[Task], world: NamedWorld, path: Path) -> Layer:
@@ -182,8 +189,9 @@ def _read_robot(robot: Path) -> tuple[dict[str, Any], type[Task], WorldConfig]:
 
 
 def _layer_of_robot(task: type[Task], robot: Path) -> Layer:
-    """A robot's settings for a task. Of a file that was written for another task, the keys of the
-    world count alone; the task's own settings follow from where the arm holds the paddle."""
+    """A robot's settings for a task. If its file was written for another task, only those keys of
+    its `env` count that every task has, and the task's own follow from where the arm holds the
+    paddle; what it says of the training, such as `ppo`, counts for any task."""
     source = f"the robot {shown_file(robot)}"
     values, its_task, env = _read_robot(robot)
     if issubclass(task, its_task):

@@ -80,7 +80,8 @@ def task_name(task: type[Task]) -> str:
 
 
 def own_task(name: str) -> type[Task] | None:
-    """The task of imported code that has a name; None for that of a package."""
+    """The task of imported code that has a name; None for that of a package, and where no imported
+    code has one of that name."""
     return None if name in registered_tasks() else class_of(name, Task)
 
 

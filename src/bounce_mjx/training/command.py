@@ -1,4 +1,5 @@
-"""The command line of a training."""
+"""What the words of `bounce-mjx train` say: its flags, and the config. `commands/train.py` acts on
+them."""
 
 import itertools
 from collections.abc import Sequence
@@ -93,10 +94,11 @@ def read_command(args: Sequence[str], machine: Path | None = None) -> TrainComma
     helps = {"-h", "--help", "--help-all"}.intersection(args)
     words = [word for word in args if word not in helps]
     _refuse_flags_of_the_word(words)
-    # The flags, of which only some are known yet, hide where another word would stand.
-    word = words[0] if words and not words[0].startswith("-") else None
-    flags = parse(ChoiceFlags, words[word is not None :], prog=PROG, is_first=True)
-    layers = read_layers(Choice(start=word, **dict(flags)), machine)
+    word, after_word = _split_word(words)
+    flags_of_choice = parse(ChoiceFlags, after_word, prog=PROG, is_first=True)
+    # From here on, the words are a typed value.
+    choice = Choice(start=word, **dict(flags_of_choice))
+    layers = read_layers(choice, machine)
     fields = fields_of_command(layers)
     if helps:
         defaults = flat(TrainFlags().model_dump()) | flat(layers.config().model_dump())
@@ -105,7 +107,7 @@ def read_command(args: Sequence[str], machine: Path | None = None) -> TrainComma
         # Prints, and exits.
         read_flags(fields, ["--help"], prog=PROG, description=ABOUT, defaults=defaults, **options)
     given = read_flags(fields, words, prog=PROG, description=ABOUT, defaults={})
-    if given.get("start") != word:
+    if given.get("start") != choice.start:
         raise UserError(
             f"{given['start']} is what the training begins with; give it first: {PROG} "
             f"{given['start']} ..."
@@ -114,6 +116,14 @@ def read_command(args: Sequence[str], machine: Path | None = None) -> TrainComma
     said = {key: value for key, value in given.items() if key in layers.fields}
     flags = typed(TrainFlags, given, names, PROG)
     return TrainCommand(flags, layers, layers.config(said, names, PROG))
+
+
+def _split_word(words: Sequence[str]) -> tuple[str | None, Sequence[str]]:
+    """The word, if there is one, and what follows it. It stands first: after flags of which only
+    some are known yet, it might be the value of one."""
+    if words and not words[0].startswith("-"):
+        return words[0], words[1:]
+    return None, words
 
 
 def _refuse_flags_of_the_word(words: Sequence[str]) -> None:

@@ -36,9 +36,9 @@ class Event:
 
 Callback = Callable[[Event], bool | None]
 """The training waits for it, and ends, as after its last step, once it returns False. An exception
-ends it as a signal does: it is raised once the state is saved. On several hosts it is called where
-the run is written. It may have two methods: `start(run, config)` is called
-for each seed before the training, and `close()` after it."""
+ends it as a signal does: it is raised once the state is saved, and the callback is called no more.
+On several hosts it is called where the run is written. It may have two methods: `start(run,
+config)` is called for each seed before the training, and `close()` after it."""
 
 
 def block_points(metrics: dict[str, np.ndarray]) -> list[dict[str, float]]:

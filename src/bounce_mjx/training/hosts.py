@@ -93,8 +93,8 @@ def agree(config: TrainConfig, resume: Path | None) -> None:
 
 def exchange(value: Any) -> list[Any]:
     """The values of all processes, by number; every process must call this at the same point. They
-    are plain data, and go through JAX's coordination service: another process may still compile,
-    for which the devices would wait for 30 s at most."""
+    are plain data, and go through JAX's coordination service. An exchange between the devices would
+    fail after 30 s, and another process may compile for longer."""
     processes = distributed.global_state
     if processes.client is None:
         return [value]
@@ -112,8 +112,9 @@ def exchange(value: Any) -> list[Any]:
 
 
 @contextlib.contextmanager
-def leave_at_once() -> Iterator[None]:
-    """If one of several processes fails, ends it without JAX's wait for the others at exit."""
+def leave_without_waiting() -> Iterator[None]:
+    """If one of several processes fails, ends it without JAX's wait for the others at exit, once
+    they have had `_GRACE_SECONDS` for their own sentences."""
     try:
         yield
     except SystemExit as error:

@@ -6,7 +6,8 @@ From a signal to its checkpoint: `StopRequest` notes the signal, the block goes 
 (`train_block`), an evaluation that is due is left out (on several hosts it is done, as a process
 that stopped alone would keep the others waiting), `is_stopping` ends the loop, and `finish` saves
 the state, waits until it is written, and raises `TrainingStopped` with the command that resumes
-the run. An exception in a callback takes the same way, and is raised at its end.
+the run. An exception in a callback takes the same way, and is raised at its end; the callback is
+called no more.
 """
 
 import concurrent.futures
@@ -151,7 +152,8 @@ def open_job(
 
 
 def make_trainer(config: TrainConfig, env: Env) -> Trainer:
-    """What trains with the algorithm of a config: the algorithm's own trainer, or that of PPO.
+    """What trains with the algorithm of a config: its own trainer, or `PPOTrainer` for `PPO` and
+    what extends it, which is below this package and so names none.
 
     Raises:
       UserError: the config does not fit it.
@@ -160,9 +162,18 @@ def make_trainer(config: TrainConfig, env: Env) -> Trainer:
     return PPOTrainer(config, env) if own_trainer is None else own_trainer
 
 
-def imports_of(config: TrainConfig) -> list[str]:
-    """The flags with which a later command imports the user's own task again."""
-    return import_flags(config.env.task)
+def imports_of(config: TrainConfig, *, to_train: bool = False) -> list[str]:
+    """The flags with which a later command imports the user's own code again.
+
+    Args:
+      to_train: whether the command trains, for which it also needs an algorithm of the user's;
+        whatever acts with the policy needs its task alone.
+    """
+    own: list[type] = [config.env.task]
+    algorithm = own_algorithm(config.algorithm)
+    if to_train and algorithm is not None:
+        own.append(algorithm)
+    return import_flags(*own)
 
 
 @dataclasses.dataclass
@@ -199,6 +210,8 @@ class Job:
     """Whether a callback has ended the training."""
     failure: BaseException | None = None
     """What a callback raised: it stops the training, as a signal does."""
+    failed_callbacks: list[events.Callback] = dataclasses.field(default_factory=list)
+    """Those that raised."""
     state: Any = None
     """State from which the resumed run starts."""
     snapshot: Snapshot | None = None
@@ -210,10 +223,10 @@ class Job:
 
     def __post_init__(self) -> None:
         config = self.config
-        intervals = config.intervals
-        self.block_steps = config.steps_per_block
-        self.eval_steps = intervals["eval_every"]
-        self.save_steps = intervals.get("save_every")
+        rounded_steps = config.rounded_steps
+        self.steps_per_block = config.steps_per_block
+        self.eval_steps = rounded_steps["eval_every"]
+        self.save_steps = rounded_steps.get("save_every")
         self.seeds = []
         for seed in range(config.seed, config.seed + config.num_seeds):
             folder = self.run / f"seed_{seed:03d}" if config.num_seeds > 1 else self.run
@@ -258,7 +271,8 @@ class Job:
                     self.say(f"the damaged checkpoint is kept as {aside}")
 
     def write_configs(self) -> None:
-        """Writes the config of the run and of each seed."""
+        """Writes the config of the run, which has changed where it is resumed with more steps, and
+        that of each seed."""
         if not hosts.is_leader():
             return
         for folder, config in self.configs_by_folder().items():
@@ -277,7 +291,7 @@ class Job:
             self.say(f"warning: the policy does not see what {term} changes")
         self.say(f"device: {self.device}  run: {self.run}")
         bound = "at most " if self.config.stop_when_solved else ""
-        steps = f"{self.config.total_steps:,}, in blocks of {self.block_steps:,}"
+        steps = f"{self.config.total_steps:,}, in blocks of {self.steps_per_block:,}"
         intervals = f"evaluated and saved every {self.eval_steps:,}"
         if self.save_steps is not None:
             intervals += f", saved every {self.save_steps:,} too"
@@ -334,7 +348,7 @@ class Job:
         return is_worth_it and is_at_evaluation and not self.is_evaluated()
 
     def evaluate(self) -> None:
-        """Evaluates the current policies, unless a stop is requested meanwhile."""
+        """Evaluates the current policies, unless the training is stopping."""
         is_first = "evaluate" not in self.clock.seconds
         policies = self.take_snapshot().policies
         progresses = [seed.progress for seed in self.seeds]
@@ -397,7 +411,7 @@ class Job:
         seconds = time.perf_counter() - started
         if self.steps == 0 and (wrong := faults.first_block_fault(metrics, self.config)):
             raise UserError(f"these settings cannot be trained: {wrong}")
-        self.steps += self.block_steps
+        self.steps += self.steps_per_block
         self.needs_save = True
         for seed in self.seeds:
             seed.report = None
@@ -410,7 +424,7 @@ class Job:
           UserError: every seed has diverged.
         """
         block_faults = metrics.pop("fault")
-        rate = len(self.seeds) * self.block_steps / seconds
+        rate = len(self.seeds) * self.steps_per_block / seconds
         metrics["speed/steps_per_second"] = np.full((len(self.seeds), 1), rate)
         points = events.block_points(metrics)
         is_first = "train" not in self.clock.seconds
@@ -453,11 +467,11 @@ class Job:
             where = ", before the final evaluation"
         jax.distributed.shutdown()
         if self.failure is not None:
-            self.say(f"a callback failed after {self.steps:,} steps; {self.go_on}")
+            self.say(f"a callback failed after {self.steps:,} steps; {self.continuing}")
             raise self.failure
         if stopping:
             raise TrainingStopped(
-                f"stopped after {self.steps:,} steps{where}; {self.go_on}{self.report_so_far}"
+                f"stopped after {self.steps:,} steps{where}; {self.continuing}{self.report_so_far}"
             )
 
     def evaluate_best(self) -> bool:
@@ -522,7 +536,7 @@ class Job:
     def why_it_ends(self) -> str:
         """Why the training ends here, in words."""
         if self.callback_has_ended and self.steps < self.config.total_steps:
-            return f"a callback ended the training after {self.steps:,} steps; {self.go_on}"
+            return f"a callback ended the training after {self.steps:,} steps; {self.continuing}"
         if not self.is_solved():
             return f"the training ends after its {self.steps:,} steps (total_steps)"
         if all(seed.progress.margin_steps is not None for seed in self.healthy()):
@@ -573,11 +587,14 @@ class Job:
         whether a callback has ended the training."""
         for event in told:
             for callback in self.callbacks:
+                if any(callback is failed for failed in self.failed_callbacks):
+                    continue
                 try:
                     answer = callback(event)
                 # Raised once the others know the event, and the state is saved (`finish`).
                 except BaseException as failure:  # noqa: BLE001
                     self.failure = self.failure or failure
+                    self.failed_callbacks.append(callback)
                     continue
                 # A comparison of NumPy's numbers has its own False.
                 if isinstance(answer, bool | np.bool_) and not answer:
@@ -585,12 +602,10 @@ class Job:
         self.callback_has_ended = hosts.any_of(self.callback_has_ended)
 
     @property
-    def go_on(self) -> str:
-        """How to continue the run."""
-        algorithm = own_algorithm(self.config.algorithm)
-        own = [self.config.env.task] if algorithm is None else [self.config.env.task, algorithm]
-        flags = [str(self.run), *import_flags(*own)]
-        return f"continue with: bounce-mjx train {shlex.join(flags)}"
+    def continuing(self) -> str:
+        """The sentence that continues the run."""
+        words = shlex.join([str(self.run), *imports_of(self.config, to_train=True)])
+        return f"continue with: bounce-mjx train {words}"
 
     @property
     def report_so_far(self) -> str:
@@ -617,11 +632,16 @@ class Job:
     def wait_for_reports(
         self, evaluate: Callable[..., list[Report]], *given: Any
     ) -> list[Report] | None:
-        """What an evaluation of given policies reports of each seed, or None if a stop was
-        requested meanwhile."""
+        """What an evaluation reports of each seed, or None if a signal has come or comes meanwhile,
+        or a callback has failed.
+
+        Args:
+          evaluate: the evaluation.
+          given: its arguments.
+        """
         # On several hosts, a process that stopped on its own would keep the others waiting.
         may_leave = jax.process_count() == 1
-        if may_leave and self.stop.requested:
+        if may_leave and (self.stop.requested or self.failure is not None):
             return None
         evaluating = self.pool.submit(evaluate, *given)
         if not self.stop.wait_for(evaluating) and may_leave:
@@ -665,7 +685,7 @@ class Job:
     def advice(self) -> str:
         """What to do after the death of a device or a save."""
         if latest := self.latest():
-            return f"{self.go_on} (the last checkpoint is {latest})"
+            return f"{self.continuing} (the last checkpoint is {latest})"
         return "start again, as no checkpoint had been saved yet"
 
     def latest(self) -> Path | None:

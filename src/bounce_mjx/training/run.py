@@ -1,4 +1,8 @@
-"""`train`, and the run that it leaves."""
+"""`train`, and the run that it leaves.
+
+`train` in Python and `bounce-mjx train` read their settings, and call `run_training`: it says what
+the config means, prints the results, and calls `job.train`, the loop that trains.
+"""
 
 import dataclasses
 import functools
@@ -12,7 +16,7 @@ import jax
 from rich.console import Console
 
 from bounce_mjx.config.command_line import stdout
-from bounce_mjx.deploy.environments import environment, policy_path
+from bounce_mjx.deploy.environments import environment
 from bounce_mjx.deploy.interface import check_interface, interface_of
 from bounce_mjx.deploy.wrappers import environments_in, in_library
 from bounce_mjx.env.env import Env
@@ -22,7 +26,7 @@ from bounce_mjx.evaluation.policy_evaluation import evaluate_policy
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.interrupt import StopRequest, in_daemon_thread
 from bounce_mjx.reports.tables import details_line, results_table, seeds_table, unsolved_line
-from bounce_mjx.resources import POLICIES
+from bounce_mjx.resources import POLICIES, policy_path
 from bounce_mjx.runs import folders
 from bounce_mjx.runs.checkpoints import read_actor
 from bounce_mjx.runs.config import TrainConfig, load_run_config
@@ -234,7 +238,7 @@ def run_training(
     resume = layers.start.run
     if resume is None:
         say(console, f"config: {layers.title}")
-    notes = notes_on_starts(config) + notes_on_worlds(config) + notes_on_intervals(config)
+    notes = notes_on_learning_rate(config) + notes_on_worlds(config) + notes_on_intervals(config)
     for note in (*layers.notes, *notes):
         say(console, f"note: {note}")
     seeds = job.train(config, console, resume=resume, callbacks=callbacks)
@@ -245,10 +249,10 @@ def run_training(
     return Run(run)
 
 
-def notes_on_starts(config: TrainConfig) -> list[str]:
+def notes_on_learning_rate(config: TrainConfig) -> list[str]:
     """A sentence where the user sets the learning rate, and it is only the one at the start."""
     is_said = config.sources["ppo.learning_rate"] in (FLAGS, PYTHON)
-    if not (is_said and config.starts_with_learning_rate):
+    if not (is_said and config.adapts_learning_rate):
         return []
     return [
         f"ppo.learning_rate {config.ppo.learning_rate} is only the first one, since ppo.target_kl "

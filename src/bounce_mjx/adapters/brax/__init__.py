@@ -1,7 +1,7 @@
 """brax: importing this package registers the environment as "bounce_ball".
 
 Then `brax.envs.get_environment("bounce_ball", control_dt=0.02)` returns a
-`BraxBounceBall` with these settings. brax's wrappers and trainers accept it, and also every
+`BraxTaskEnv` with these settings. brax's wrappers and trainers accept it, and also every
 `Env`.
 """
 
@@ -12,7 +12,7 @@ with needed("brax", "bounce_mjx"):
     import_mjx()
     import brax.envs
 
-from bounce_mjx.adapters.brax.environment import ENV_NAME, BraxBounceBall, make_env
+from bounce_mjx.adapters.brax.environment import ENV_NAME, BraxTaskEnv, make_env
 from bounce_mjx.adapters.brax.ppo import (
     device_put_replicated,
     load_brax_policy,
@@ -23,7 +23,7 @@ from bounce_mjx.env.env import Env
 
 __all__ = [
     "ENV_NAME",
-    "BraxBounceBall",
+    "BraxTaskEnv",
     "device_put_replicated",
     "load_brax_policy",
     "network_settings",

@@ -15,7 +15,7 @@ import numpy as np
 from brax.io import image, mjcf
 from flax import struct
 
-from bounce_mjx.adapters.randomization import randomized_task
+from bounce_mjx.adapters.randomization import randomized_env
 from bounce_mjx.deploy.environments import environment, refuse_warmup
 from bounce_mjx.env.env import Env, EnvState, State
 from bounce_mjx.errors import UserError
@@ -62,22 +62,22 @@ class PipelineState:
         return brax.base.Transform(pos=data.xpos[1:].copy(), rot=data.xquat[1:].copy())
 
 
-class BraxBounceBall(brax.envs.Env):
-    """One environment with brax's interface; `task` is the `Env` in it."""
+class BraxTaskEnv(brax.envs.Env):
+    """One environment with brax's interface; `core` is the `Env` in it."""
 
     def __init__(self, env: Env):
         """Wraps an environment, such as from `environment`. Its time limit has no effect: brax's
         wrappers and trainers end the episodes, after their own `episode_length`
-        (`task.config.episode_steps` is the config's).
+        (`core.config.episode_steps` is the config's).
 
         Raises:
           UserError: it has a warm-up.
         """
         refuse_warmup(env.config, ENV_NAME)
-        self.task = env
-        self.dt = self.task.dt
+        self.core = env
+        self.dt = self.core.dt
         """Time of one control step, s."""
-        self.mj_model = self.task.mj_model
+        self.mj_model = self.core.mj_model
         """MuJoCo's model."""
         self._model = _Model(self.mj_model)
 
@@ -96,16 +96,16 @@ class BraxBounceBall(brax.envs.Env):
 
     def reset(self, rng: jax.Array) -> State:
         """Starts an episode; consumes the key `rng`."""
-        task = self.task
+        env = self.core
         # Only an environment that was asked for it has one.
         if "sys" in vars(self):
-            task = randomized_task(task, self._own_sys, self.sys)
-        return self._to_brax(task.reset(rng))
+            env = randomized_env(env, self._own_sys, self.sys)
+        return self._to_brax(env.reset(rng))
 
     def step(self, state: State, action: jax.Array) -> State:
         """Advances one control step under the action [action_size]."""
         plain = state.replace(pipeline_state=_complete(state.pipeline_state.task))
-        return self._to_brax(self.task.step(plain, action))
+        return self._to_brax(self.core.step(plain, action))
 
     def _to_brax(self, state: State) -> State:
         return state.replace(pipeline_state=PipelineState(state.pipeline_state, self._model))
@@ -113,17 +113,17 @@ class BraxBounceBall(brax.envs.Env):
     @property
     def observation_size(self) -> int:
         """Length of the observation vector."""
-        return self.task.observation_size
+        return self.core.observation_size
 
     @property
     def action_size(self) -> int:
         """Length of the action vector."""
-        return self.task.action_size
+        return self.core.action_size
 
     @property
     def backend(self) -> str:
         """Name of the physics engine."""
-        return self.task.backend
+        return self.core.backend
 
     def render(
         self,
@@ -141,8 +141,8 @@ class BraxBounceBall(brax.envs.Env):
         return image.render_array(self.sys, trajectory, height, width, camera)
 
 
-def make_env(config: WorldConfig | None = None, **settings: Any) -> BraxBounceBall:
-    """What `brax.envs.get_environment` calls: a `BraxBounceBall` of an `environment`.
+def make_env(config: WorldConfig | None = None, **settings: Any) -> BraxTaskEnv:
+    """What `brax.envs.get_environment` calls: a `BraxTaskEnv` of an `environment`.
 
     Args:
       config: all settings, on which the others lie; None for those of the task or the policy.
@@ -164,7 +164,7 @@ def make_env(config: WorldConfig | None = None, **settings: Any) -> BraxBounceBa
             if value is not None:
                 raise UserError(f"config and {name} both say the environment; give one of them")
         start = config
-    return BraxBounceBall(environment(start, **settings))
+    return BraxTaskEnv(environment(start, **settings))
 
 
 def _complete(state: EnvState) -> EnvState:

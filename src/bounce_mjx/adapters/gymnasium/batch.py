@@ -56,7 +56,7 @@ class Batch:
         Raises:
           UserError: an argument is wrong, or the environment has a warm-up.
         """
-        self.env = env
+        self.core = env
         self.config = env.config
         refuse_warmup(self.config, "the environment's settings")
         self.num_envs = whole_number("num_envs", num_envs)
@@ -75,17 +75,17 @@ class Batch:
     @functools.cached_property
     def programs(self) -> Programs:
         """The compiled functions; batches of equal environments share them."""
-        return shared_programs(self.env)
+        return shared_programs(self.core)
 
     @property
     def action_space(self) -> Box:
         """The space of the actions of one environment."""
-        return Box(-1.0, 1.0, (self.env.action_size,), np.float32)
+        return Box(-1.0, 1.0, (self.core.action_size,), np.float32)
 
     @property
     def observation_space(self) -> Box:
         """The space of the observations of one environment."""
-        return Box(-np.inf, np.inf, (self.env.observation_size,), np.float32)
+        return Box(-np.inf, np.inf, (self.core.observation_size,), np.float32)
 
     def start(self, mask: np.ndarray, seeds: np.ndarray, goals: Goals) -> np.ndarray:
         """Starts new episodes where the mask [B] is true: the observations of all environments
@@ -123,7 +123,7 @@ class Batch:
             self._episodes, actions, self.episode_steps, seeds, reset_before, reset_after
         )
         rows = np.asarray(rows)
-        size = self.env.observation_size
+        size = self.core.observation_size
         numbers = rows[2 * size :].astype(np.float64)
         return StepArrays(
             observation=_with_batch_first(rows[:size]),

@@ -22,7 +22,7 @@ from bounce_mjx.adapters.gymnasium.batch import (
     checked_actions,
 )
 from bounce_mjx.adapters.gymnasium.pictures import Pictures
-from bounce_mjx.deploy.environments import Start, environment
+from bounce_mjx.deploy.environments import EnvironmentOf, environment
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 
@@ -81,14 +81,14 @@ class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self._spec = _TaskSpec.limited(spec, self.episode_steps)
 
     @property
-    def task(self) -> Env:
-        """The environment on JAX."""
-        return self._batch.env
+    def core(self) -> Env:
+        """The `Env` in it, on JAX."""
+        return self._batch.core
 
     @property
     def mj_model(self) -> mujoco.MjModel:
         """MuJoCo's model, to read; edits have no effect."""
-        return self.task.mj_model
+        return self.core.mj_model
 
     @property
     def dt(self) -> float:
@@ -191,7 +191,7 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
         self._ended = np.zeros(num_envs, bool)
 
     spec = TaskEnv.spec
-    task = TaskEnv.task
+    core = TaskEnv.core
     mj_model = TaskEnv.mj_model
     dt = TaskEnv.dt
     episode_steps = TaskEnv.episode_steps
@@ -326,7 +326,7 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarra
 
 
 def make_env(
-    task: Start | None = None,
+    task: EnvironmentOf | None = None,
     render_mode: str | None = None,
     max_episode_steps: int | None = None,
     width: int = 640,
@@ -346,7 +346,7 @@ def make_env(
 
 
 def make_vector_env(
-    task: Start | None = None,
+    task: EnvironmentOf | None = None,
     num_envs: int = 1,
     render_mode: str | None = None,
     max_episode_steps: int | None = None,

@@ -52,7 +52,7 @@ class Pictures:
 
     @functools.cached_property
     def _renderer(self) -> Renderer:
-        renderer = Renderer(self._batch.env, self._width, self._height, self._camera, plain=True)
+        renderer = Renderer(self._batch.core, self._width, self._height, self._camera, plain=True)
         self._close_renderer = weakref.finalize(self, renderer.close)
         # The renderer closes itself.
         self._close_renderer.atexit = False

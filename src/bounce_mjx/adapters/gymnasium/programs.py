@@ -33,14 +33,14 @@ class Programs:
 
     def __init__(self, env: Env):
         cache_compilations()
-        self.task = env
+        self.core = env
         self.start = jax.jit(self._start)
         self.step = jax.jit(self._step, donate_argnums=0)
 
     @functools.cached_property
     def metric_names(self) -> tuple[str, ...]:
         """Names of the environment's metrics, sorted."""
-        return tuple(sorted(jax.eval_shape(self.task.reset, jax.random.PRNGKey(0)).metrics))
+        return tuple(sorted(jax.eval_shape(self.core.reset, jax.random.PRNGKey(0)).metrics))
 
     def _start(
         self,
@@ -57,14 +57,14 @@ class Programs:
         """
 
         def first_state(key: jax.Array, goals: dict[str, jax.Array]) -> State:
-            ranges = self.task.ranges()
-            for name, goal in self.task.config.goals.items():
+            ranges = self.core.ranges()
+            for name, goal in self.core.config.goals.items():
                 given = goals[name]
                 is_free = jnp.isnan(given)
                 low = jnp.where(is_free, goal.low, given)
                 high = jnp.where(is_free, goal.high, given)
                 ranges[name] = low, high
-            return self.task.reset(key, ranges)
+            return self.core.reset(key, ranges)
 
         states = jax.vmap(first_state, -1, -1)(_keys(seeds), goals)
         started = self._episodes(states, jnp.zeros(seeds.shape, jnp.int32))
@@ -94,7 +94,7 @@ class Programs:
           time limit did, and the metrics.
         """
         before = State(episodes.state, obs=None, reward=None, done=None)
-        stepped = jax.vmap(self.task.step, -1, -1)(before, actions.T)
+        stepped = jax.vmap(self.core.step, -1, -1)(before, actions.T)
         length = episodes.length + 1
         terminated = (stepped.done > 0) & ~reset_before
         # The limit counts even if the task ended the episode too, as in Gymnasium's TimeLimit.
@@ -104,7 +104,7 @@ class Programs:
         restarts = reset_before | (reset_after & (terminated | truncated))
 
         def restart() -> Episodes:
-            states = jax.vmap(self.task.reset, -1, -1)(_keys(seeds))
+            states = jax.vmap(self.core.reset, -1, -1)(_keys(seeds))
             return _choose(restarts, self._episodes(states, jnp.zeros_like(length)), continued)
 
         after = jax.lax.cond(jnp.any(restarts), restart, lambda: continued)

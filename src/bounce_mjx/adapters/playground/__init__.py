@@ -12,9 +12,9 @@ from bounce_mjx.errors import exit_on_user_error
 # As long as Python looks for the program of `python -m`, the first argument is -m.
 _is_program = sys.argv[:1] == ["-m"]
 with exit_on_user_error() if _is_program else contextlib.nullcontext():
-    from bounce_mjx.adapters.playground.environment import PlaygroundBounceBall
+    from bounce_mjx.adapters.playground.environment import PlaygroundTaskEnv
     from bounce_mjx.adapters.playground.registration import register
 
     register()
 
-__all__ = ["PlaygroundBounceBall"]
+__all__ = ["PlaygroundTaskEnv"]

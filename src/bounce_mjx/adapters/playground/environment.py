@@ -11,9 +11,9 @@ import mujoco
 import numpy as np
 from flax import struct
 
-from bounce_mjx.adapters.randomization import randomized_task
+from bounce_mjx.adapters.randomization import randomized_env
 from bounce_mjx.deploy.environments import (
-    Start,
+    EnvironmentOf,
     environment,
     environment_config,
     refuse_warmup,
@@ -36,7 +36,7 @@ with needed("MuJoCo Playground", "playground<1"):
 ENV_NAME = "BounceBall"
 
 
-def default_config(task: Start | None = None, **settings: Any) -> config_dict.ConfigDict:
+def default_config(task: EnvironmentOf | None = None, **settings: Any) -> config_dict.ConfigDict:
     """The settings of an environment, some under Playground's own names.
 
     Args:
@@ -85,8 +85,8 @@ class TaskData:
     """Everything else that the next step depends on."""
 
 
-class PlaygroundBounceBall(MjxEnv):
-    """One environment with Playground's interface; `task` is the `Env` in it."""
+class PlaygroundTaskEnv(MjxEnv):
+    """One environment with Playground's interface; `core` is the `Env` in it."""
 
     def __init__(self, env: Env, config: config_dict.ConfigDict | None = None):
         """Wraps an environment, such as from `environment`.
@@ -101,21 +101,21 @@ class PlaygroundBounceBall(MjxEnv):
         """
         refuse_warmup(env.config, ENV_NAME)
         super().__init__(config_of(env.config) if config is None else config)
-        self.task = env
+        self.core = env
 
     def reset(self, rng: jax.Array) -> State:
         """Starts an episode; consumes the key `rng`."""
-        task = self.task
+        env = self.core
         if "_mjx_model" in vars(self):
-            task = randomized_task(task, self._own_mjx_model, self._mjx_model)
-        state = task.reset(rng)
+            env = randomized_env(env, self._own_mjx_model, self._mjx_model)
+        state = env.reset(rng)
         physics = state.pipeline_state.physics
         dtype = physics.qpos.dtype
         still = jnp.zeros(self.action_size, dtype)
         data = TaskData(
             **physics._asdict(),
             time=jnp.zeros((), dtype),
-            ctrl=self.task.control(state.pipeline_state, still)[0].ctrl,
+            ctrl=self.core.control(state.pipeline_state, still)[0].ctrl,
             mocap_pos=jnp.zeros((self.mj_model.nmocap, 3), dtype),
             mocap_quat=jnp.zeros((self.mj_model.nmocap, 4), dtype),
             xfrc_applied=jnp.zeros((self.mj_model.nbody, 6), dtype),
@@ -128,11 +128,11 @@ class PlaygroundBounceBall(MjxEnv):
         data = state.data
         physics = PhysicsState(data.qpos, data.qvel)
         before = core.State(data.task._replace(physics=physics), **_common(state))
-        after = self.task.step(before, action)
-        control, _ = self.task.control(before.pipeline_state, action)
+        after = self.core.step(before, action)
+        control, _ = self.core.control(before.pipeline_state, action)
         data = data.replace(
             **after.pipeline_state.physics._asdict(),
-            time=data.time + self.task.dt,
+            time=data.time + self.core.dt,
             ctrl=control.ctrl,
             task=after.pipeline_state._replace(physics=None),
         )
@@ -141,18 +141,18 @@ class PlaygroundBounceBall(MjxEnv):
     @property
     def xml_path(self) -> str:
         """The MJCF file."""
-        mjcf = self.task.config.mjcf
+        mjcf = self.core.config.mjcf
         return str(resource_path("mjcf/bounce_ball.xml") if mjcf is None else locate(mjcf))
 
     @property
     def action_size(self) -> int:
         """Length of the action vector."""
-        return self.task.action_size
+        return self.core.action_size
 
     @property
     def mj_model(self) -> mujoco.MjModel:
         """The model."""
-        return self.task.mj_model
+        return self.core.mj_model
 
     @property
     def mjx_model(self) -> mjx.Model:
@@ -184,11 +184,11 @@ class PlaygroundBounceBall(MjxEnv):
 def make_env(
     config: config_dict.ConfigDict | None = None,
     config_overrides: dict[str, Any] | None = None,
-    task: Start | None = None,
+    task: EnvironmentOf | None = None,
     policy: str | os.PathLike | None = None,
     world: str | os.PathLike | None = None,
-) -> PlaygroundBounceBall:
-    """What Playground's `registry.load` calls: a `PlaygroundBounceBall` of an `environment`.
+) -> PlaygroundTaskEnv:
+    """What Playground's `registry.load` calls: a `PlaygroundTaskEnv` of an `environment`.
 
     Args:
       config: must be the one of the task or the policy (`default_config`), whose values it may
@@ -216,7 +216,7 @@ def make_env(
         "episode_seconds": config.episode_length * config.ctrl_dt,
     }
     env = environment(task, world, policy=policy, **settings)
-    return PlaygroundBounceBall(env, config)
+    return PlaygroundTaskEnv(env, config)
 
 
 def _common(state: State | core.State) -> dict[str, Any]:

@@ -25,8 +25,8 @@ class RslRlVecEnv(VecEnv):
         self.num_actions = env.num_actions
         self.max_episode_length = env.episode_steps
         self.device = env.device
-        self.cfg = env.env.config
-        self.step_dt = env.env.dt
+        self.cfg = env.core.config
+        self.step_dt = env.core.dt
         self.physics_dt = self.cfg.physics_dt
         self.render_mode = None
         self._seed: int | None = None

@@ -71,20 +71,20 @@ class TorchVectorEnv:
         """
         if not isinstance(num_envs, numbers.Integral) or num_envs < 1:
             raise UserError(f"num_envs is {num_envs!r}, but must be a whole number of at least 1")
-        self.env = env
+        self.core = env
         self.num_envs = num_envs
-        self.num_observations = self.env.observation_size
-        self.num_actions = self.env.action_size
+        self.num_observations = self.core.observation_size
+        self.num_actions = self.core.action_size
         self.device = _shared_device()
         self._reward_scale = reward_scale
         self._key = _committed_key(seed)
         if critic_metrics is None:
-            critic_metrics = self.env.task.critic_metrics
-        metrics = jax.eval_shape(self.env.reset, self._key).metrics
+            critic_metrics = self.core.task.critic_metrics
+        metrics = jax.eval_shape(self.core.reset, self._key).metrics
         self.critic_metrics = matching_metrics(critic_metrics, metrics)
         self.metric_names = tuple(metrics)
         action = jax.ShapeDtypeStruct((num_envs, self.num_actions), jnp.float32)
-        steps = jnp.int32(0) if self.env.warmup_steps else None
+        steps = jnp.int32(0) if self.core.warmup_steps else None
         carried, *_ = jax.eval_shape(self._start, self._key, steps)
         _, result = jax.eval_shape(self._step, carried, action)
         self._carried_layout = Layout(carried)
@@ -96,7 +96,7 @@ class TorchVectorEnv:
     @property
     def episode_steps(self) -> int:
         """Time limit of an episode in steps: that of the environment's config."""
-        return self.env.config.episode_steps
+        return self.core.config.episode_steps
 
     def reset(self, seed: int | None = None) -> tuple[torch.Tensor, torch.Tensor]:
         """Starts a new episode in every environment; a `seed` seeds all following resets. It
@@ -108,7 +108,7 @@ class TorchVectorEnv:
         Returns:
           The observations [B, N] and the critic metrics [B, K].
         """
-        steps = jnp.int32(0) if self.env.warmup_steps else None
+        steps = jnp.int32(0) if self.core.warmup_steps else None
         if seed is not None:
             self._key = _committed_key(seed)
         elif self._block is not None:
@@ -174,8 +174,8 @@ class TorchVectorEnv:
         self, key: jax.Array, steps: jax.Array | None
     ) -> tuple["_Carried", jax.Array, jax.Array]:
         key, reset_key = jax.random.split(key)
-        ranges = vector.ranges_after(self.env, steps, self.num_envs)
-        state = vector.reset(self.env, reset_key, self.num_envs, ranges)
+        ranges = vector.ranges_after(self.core, steps, self.num_envs)
+        state = vector.reset(self.core, reset_key, self.num_envs, ranges)
         critic_metrics = self._critic_metrics(state.env.metrics)
         return _Carried(_slim(state), key, steps), vector.observe(state), critic_metrics
 
@@ -192,9 +192,9 @@ class TorchVectorEnv:
     def _step(self, carried: "_Carried", action: jax.Array) -> tuple["_Carried", StepResult]:
         key, reset_key = jax.random.split(carried.key)
         steps = None if carried.steps is None else carried.steps + 1
-        ranges = vector.ranges_after(self.env, steps, self.num_envs)
+        ranges = vector.ranges_after(self.core, steps, self.num_envs)
         state, result = vector.step(
-            self.env, carried.state, action, reset_key, self.episode_steps, ranges
+            self.core, carried.state, action, reset_key, self.episode_steps, ranges
         )
         metrics = jnp.stack([result.metrics[name] for name in self.metric_names])
         arrays = StepResult(
