@@ -14,8 +14,9 @@ Robots (`--tool-pose /tcp_pose_broadcaster/pose`, PoseStamped, the tool centre p
 ur_rtde_bridge.py), also tells whether it is the policy's arm. A pose of TF does not: it comes from
 /joint_states and a file.
 
-Publish a message on /start for each episode, also after a fault; if the arm was moved with its
-servos off, start the program again. Read "Safety" in docs/your-arm.md first.
+Publish a message on /start for each episode; where the arm has stopped, one sends it home first. If
+the arm was moved with its servos off, start the program again. Read "Safety" in docs/your-arm.md
+first.
 """
 
 import argparse
@@ -30,6 +31,8 @@ from std_msgs.msg import Empty, Float64MultiArray, Header
 
 from bounce_mjx import load_policy
 from bounce_mjx.deploy.box import add_box, box_of
+from bounce_mjx.deploy.faults import picture_age
+from bounce_mjx.deploy.session import heed_word
 
 RATE = 500.0
 """Commands a second, Hz."""
@@ -67,6 +70,9 @@ class Bridge(Node):
         self.measurements = {"target_height": target_height}
         self.awaited = {"joint_angles"}
         """What has to be measured before the first command."""
+        self.max_first_ball_age = picture_age(policy.metadata)
+        self.joint_stamp = None
+        """When the newest joint angles were measured."""
         self.picture_stamp = None
         """When the newest picture of the ball was taken."""
         self.commands = []
@@ -86,6 +92,7 @@ class Bridge(Node):
         """Takes the arm's angles; a message of other joints, such as a gripper's, has none."""
         if not set(self.joint_names) <= set(message.name):
             return
+        self.joint_stamp = message.header.stamp
         places = [message.name.index(name) for name in self.joint_names]
         self.measurements["joint_angles"] = [message.position[place] for place in places]
         if len(message.velocity) == len(message.name):
@@ -129,9 +136,10 @@ class Bridge(Node):
         """Starts an episode where the arm is ready, and sends it home where it has stopped."""
         if self.arm.state == "stopped":
             self.get_logger().info(f"stopped as {self.arm.reason}; going home")
-            self.arm.restart()
-        elif self.arm.state == "ready":
-            self.arm.start()
+        ball_age = self.timed_measurements().get("ball_age", np.inf)
+        refused = heed_word(self.arm, ball_age, self.max_first_ball_age)
+        if refused is not None:
+            self.get_logger().info(f"nothing starts: {refused}")
 
     def tick(self) -> None:
         """Publishes the next command; after the last one, a new control step begins."""
@@ -146,9 +154,13 @@ class Bridge(Node):
         self.publisher.publish(Float64MultiArray(data=command.tolist()))
 
     def timed_measurements(self) -> dict:
-        """The newest measurements, with the time now and the age of the ball's picture, s."""
-        now = self.get_clock().now()
-        measurements = self.measurements | {"time": now.nanoseconds * 1e-9}
+        """The newest measurements, with the time of the joint angles, which stands where none come,
+        and the age of the ball's picture by then, s."""
+        measurements = dict(self.measurements)
+        if self.joint_stamp is None:
+            return measurements
+        now = Time.from_msg(self.joint_stamp)
+        measurements["time"] = now.nanoseconds * 1e-9
         if self.picture_stamp is not None:
             ball_age = now - Time.from_msg(self.picture_stamp)
             measurements["ball_age"] = ball_age.nanoseconds * 1e-9

@@ -3,7 +3,8 @@
 `python examples/ur_rtde_bridge.py ROBOT_IP POLICY --box 0.2 -0.5 -0.2 1.0 0.5 0.6` reads the ball
 from UDP datagrams "x y z age" (m in the controller's feature Base, s) on port 5005 of this
 computer; for a camera on another one, give the address at which this one is reached (`--listen`).
-Each episode starts when Enter is pressed, with the hands away from the arm.
+Each episode starts when Enter is pressed, with the hands away from the arm; after a lost ball the
+arm rests until Enter sends it home.
 
 Set the tool centre point on the pendant to the paddle's centre, with its z along the paddle's upper
 normal: nothing is sent to an arm whose controller has the paddle elsewhere than the policy, such as
@@ -14,12 +15,14 @@ import argparse
 import select
 import socket
 import sys
+import time
 from collections.abc import Callable
 
 import numpy as np
 
 from bounce_mjx import load_policy
 from bounce_mjx.deploy.box import add_box, box_of
+from bounce_mjx.deploy.session import BALL_GONE, heed_word
 
 RATE = 500.0
 """Commands a second, Hz."""
@@ -29,8 +32,8 @@ GAIN = 300
 """Of `servoJ`, from 100 to 2000."""
 MAX_FIRST_BALL_AGE = 0.05
 """An episode starts only with a newer picture of the ball, s."""
-BALL_GONE = ("ball_lost", "ball_flight")
-"""Faults after which the operator may start another episode."""
+OVER = "the time is over"
+"""Why the arm stops at the end."""
 # The order of RTDE's arrays.
 JOINTS = (
     "shoulder_pan_joint",
@@ -49,24 +52,28 @@ class Camera:
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.socket.bind((address, port))
         self.socket.setblocking(False)
+        self.clock = time.monotonic
         self.newest: dict = {}
-        """The ball's position [3], m, and its age, s."""
+        """The ball's position [3], m."""
+        self.taken = -np.inf
+        """When its picture was taken, s of the clock."""
         self.ignored = 0
         """Datagrams that were not four finite numbers."""
 
-    def measure(self, control_dt: float) -> dict:
-        """Position and age of the ball, once each control step.
+    def measure(self) -> dict:
+        """Position and age of the ball now; the age is infinite before the first datagram."""
+        self.receive()
+        return self.newest | {"ball_age": self.clock() - self.taken}
 
-        The age grows by a control step until the next datagram, and is infinite before the first.
-        """
-        age = self.newest.get("ball_age", np.inf) + control_dt
-        self.newest = self.newest | {"ball_age": age}
+    def receive(self) -> None:
+        """Takes what has arrived, once each period of the robot: a datagram that waits is younger
+        than its picture."""
         while True:
             try:
                 datagram = self.socket.recv(256)
             except BlockingIOError:
                 # No more have arrived.
-                return self.newest
+                return
             self.take(datagram)
 
     def take(self, datagram: bytes) -> None:
@@ -79,7 +86,8 @@ class Camera:
         if numbers.shape != (4,) or not np.all(np.isfinite(numbers)):
             self.ignored += 1
             return
-        self.newest = {"ball_position": numbers[:3], "ball_age": float(numbers[3])}
+        self.newest = {"ball_position": numbers[:3]}
+        self.taken = self.clock() - float(numbers[3])
 
 
 def has_pressed_enter() -> bool:
@@ -98,13 +106,15 @@ def bounce(
     box: dict,
     is_told: Callable[[], bool] = has_pressed_enter,
 ) -> list[str]:
-    """Bounces for a time, again on the operator's word after each lost ball, until another fault.
+    """Bounces for a time by the robot's clock, and brakes. After a lost ball the arm rests until
+    the operator's word sends it home, and another one starts an episode; another fault ends it.
 
     Args:
       policy: the result of `load_policy`.
       rtde_c: ur_rtde's `RTDEControlInterface`.
       rtde_r: its `RTDEReceiveInterface`.
-      camera: its `measure` returns the ball's part of the measurements.
+      camera: its `measure` returns the ball's part of the measurements, its `receive` takes what
+        has arrived.
       goals: such as the target height, m.
       box: the `box` of `DeployedPolicy.supervise`, m; empty for none.
       is_told: whether the operator has given the word to start since it was last asked.
@@ -112,17 +122,17 @@ def bounce(
     Returns:
       Why the arm stopped, each time.
     """
-    # Where the controller holds the arm, which no reading of ours can be wrong about.
+    # Where the controller holds the arm, whatever its encoders say.
     policy.reset(np.array(rtde_r.getTargetQ()))
     arm = policy.supervise(RATE, **box)
-    control_dt = policy.metadata.control_dt
     reasons = []
-    was_ready = False
+    was = arm.state
+    until = rtde_r.getTimestamp() + seconds
     # A period begins before reading and computing, so that a control step lasts whole periods.
     t_start = rtde_c.initPeriod()
     try:
-        for _ in range(round(seconds / control_dt)):
-            ball = camera.measure(control_dt)
+        while True:
+            ball = camera.measure()
             measurements = {
                 "joint_angles": rtde_r.getActualQ(),
                 "joint_velocities": rtde_r.getActualQd(),
@@ -131,28 +141,35 @@ def bounce(
                 **ball,
                 **goals,
             }
+            if measurements["time"] >= until:
+                arm.stop(OVER, OVER)
             commands = arm.commands(measurements)
             for joint_angles in commands:
                 servo(rtde_c, joint_angles)
                 rtde_c.waitPeriod(t_start)
                 t_start = rtde_c.initPeriod()
+                camera.receive()
             if len(commands) == 0:
                 # The first sample is not believed yet, and nothing is sent.
                 rtde_c.waitPeriod(t_start)
                 t_start = rtde_c.initPeriod()
-            is_ready = arm.state == "ready"
-            if is_ready and not was_ready:
-                print("the arm is ready")
-            was_ready = is_ready
-            # A word that comes before the arm is ready does not count.
-            has_word = is_told()
-            if is_ready and has_word and ball["ball_age"] < MAX_FIRST_BALL_AGE:
-                arm.start()
-            elif arm.state == "stopped":
+            state = arm.state
+            has_changed = state != was
+            was = state
+            if state == "stopped" and arm.fault == OVER:
+                break
+            if state == "stopped" and has_changed:
                 reasons.append(arm.reason)
                 if arm.fault not in BALL_GONE:
                     break
-                arm.restart()
+                print(f"stopped as {arm.reason}; press Enter to go home, with no hand near")
+            elif state == "ready" and has_changed:
+                print("the arm is ready; press Enter to start")
+            # A word that comes in another state does not count.
+            if is_told() and state in ("ready", "stopped"):
+                refused = heed_word(arm, ball["ball_age"], MAX_FIRST_BALL_AGE)
+                if refused is not None:
+                    print(refused)
     finally:
         # Whatever ends the loop, the arm does not go on toward its last command.
         rtde_c.servoStop()

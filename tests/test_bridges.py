@@ -113,8 +113,11 @@ def test_ur_rtde_bridge() -> None:
 
     bridge = runpy.run_path(str(EXAMPLES / "ur_rtde_bridge.py"))
 
+    rests: list[int] = []
+
     class Control:
         in_period = False
+        was_stopped = False
 
         def initPeriod(self) -> int:
             self.in_period = True
@@ -129,6 +132,13 @@ def test_ur_rtde_bridge() -> None:
         def waitPeriod(self, period: int) -> None:
             assert period == world.ticks
             self.in_period = False
+            is_stopped = supervised[-1].state == "stopped"
+            if is_stopped and not self.was_stopped and world.before:
+                rests.append(0)
+            rests_on = is_stopped and rests and np.array_equal(self.sent, world.commands[-1])
+            self.was_stopped = is_stopped
+            if rests_on:
+                rests[-1] += 1
             knocked(world)
             world.tick(self.sent)
             world.watch(supervised[-1])
@@ -173,27 +183,32 @@ def test_ur_rtde_bridge() -> None:
 
     camera = bridge["Camera"].__new__(bridge["Camera"])
     camera.socket, camera.newest, camera.ignored = Socket(), {}, 0
+    camera.clock, camera.taken = (lambda: world.time), -np.inf
     control, receive = Control(), Receive()
     wished = {"target_height": 0.5}
     asked = []
 
     def is_told() -> bool:
-        """The operator gives the word when the arm has been ready for half a second."""
-        is_ready = supervised[-1].state == "ready"
+        """The operator gives the word when the arm has waited for it for half a second."""
+        is_ready = supervised[-1].state in ("ready", "stopped")
         asked.append(is_ready)
         return is_ready and all(asked[-50:]) and len(asked) >= 50
 
     box = {"box": BOX}
     policy = watched_policy()
     reasons = bridge["bounce"](policy, control, receive, camera, wished, SECONDS, box, is_told)
-    assert control.stopped and world.ticks == SECONDS * RATE
+    # It brakes at the end, within the box of time and some more.
+    assert control.stopped and 0 <= world.ticks - SECONDS * RATE <= 0.3 * RATE
+    assert np.ptp(world.commands[-5:], axis=0).max() < 1e-9
+    # No hand is met by an arm that went home after the lost ball before the word.
+    assert len(rests) == 2 and rests[0] >= 0.49 * RATE
     assert boxes == [box]
     # After the lost ball the arm was ready, and waited for the word.
     waits = "".join("r" if is_ready else "." for is_ready in asked)
-    assert len(re.findall("r{50}", waits)) == 2
+    assert len(re.findall("r{50}", waits)) == 3
     check(world, reasons)
     assert camera.ignored == 5
-    # Only a lost ball starts it again by itself.
+    # After another fault, no word starts it again.
     receive.broken = True
     policy = watched_policy()
     reasons = bridge["bounce"](policy, control, receive, camera, wished, SECONDS, {}, is_told)
@@ -230,7 +245,7 @@ def test_a_bridge_does_not_begin_at_readings_that_its_controller_contradicts() -
         getTimestamp=lambda: 0.002 * len(ticks),
         getActualTCPPose=lambda: [0.0] * 6,
     )
-    camera = message(measure=lambda control_dt: {"ball_age": np.inf})
+    camera = message(measure=lambda: {"ball_age": np.inf}, receive=lambda: None)
     reasons = bridge["bounce"](policy, control, receive, camera, {}, 6.0, {}, lambda: True)
     assert not sent and len(reasons) == 1
     assert "Joint2 is 2 rad from where its commands rest" in reasons[0]
@@ -283,7 +298,7 @@ def test_a_ur_bridge_sends_nothing_to_another_robot(robot, parked) -> None:
         getTimestamp=lambda: 0.002 * len(ticks),
         getActualTCPPose=lambda: tool_pose(robot, arm.angles),
     )
-    camera = message(measure=lambda control_dt: {"ball_age": np.inf})
+    camera = message(measure=lambda: {"ball_age": np.inf}, receive=lambda: None)
     reasons = bridge["bounce"](policy, control, receive, camera, {}, 6.0, {}, lambda: False)
     if robot == "UR5e":
         assert not reasons and sent
@@ -383,6 +398,7 @@ def test_ros2_bridge(monkeypatch: pytest.MonkeyPatch) -> None:
         if count >= 10:
             node.subscribed[tool_topic](tool_message(world))
         state = message(
+            header=message(stamp=stamp_of(world.time)),
             name=backwards,
             position=world.data.qpos[:6][::-1].tolist(),
             velocity=world.data.qvel[:6][::-1].tolist(),
@@ -394,8 +410,7 @@ def test_ros2_bridge(monkeypatch: pytest.MonkeyPatch) -> None:
         if picture is not None and picture[0] != shown:
             shown = picture[0]
             point = message(**dict(zip("xyz", picture[1], strict=True)))
-            stamp = message(sec=int(shown), nanosec=round(shown % 1 * 1e9))
-            header = message(stamp=stamp, frame_id="base")
+            header = message(stamp=stamp_of(shown), frame_id="base")
             node.subscribed["/ball"](message(point=point, header=header))
         if node.arm.state in ("ready", "stopped"):
             node.subscribed["/start"](message())
@@ -403,6 +418,7 @@ def test_ros2_bridge(monkeypatch: pytest.MonkeyPatch) -> None:
         knocked(world)
         world.tick(getattr(node, "sent", world.data.ctrl))
         world.watch(node.arm)
+    said = [words for words in said if words.startswith("stopped")]
     assert len(said) == 1
     check(world, [said[0].removeprefix("stopped as ").removesuffix("; going home")])
     # A message without velocities brakes the arm.
@@ -411,6 +427,16 @@ def test_ros2_bridge(monkeypatch: pytest.MonkeyPatch) -> None:
     for _ in range(RATE // 10):
         tick()
     assert node.arm.state == "stopped" and "joint_velocities" in node.arm.reason
+    # Angles that come no more are no new ones.
+    node.subscribed["/start"](message())
+    assert node.arm.state == "homing"
+    for _ in range(RATE // 10):
+        tick()
+    assert (node.arm.state, node.arm.fault) == ("stopped", "time")
+
+
+def stamp_of(time: float) -> types.SimpleNamespace:
+    return message(sec=int(time), nanosec=round(time % 1 * 1e9))
 
 
 def tool_message(world: World, frame: str = "base") -> types.SimpleNamespace:
@@ -449,7 +475,8 @@ def test_a_ros2_bridge_sends_nothing_to_an_arm_with_another_tool(
     rests_at = world.data.ctrl[:6].tolist()
     for off in (0.0, 0.1):
         node = bridge["Bridge"](load_policy("robust"), rests_at, {"box": BOX}, "base", "/tool")
-        state = message(name=world.names, position=rests_at, velocity=[0.0] * 6)
+        header = message(stamp=stamp_of(0.0))
+        state = message(header=header, name=world.names, position=rests_at, velocity=[0.0] * 6)
         tool = tool_message(world)
         tool.pose.position.x += off
         node.subscribed["/joint_states"](state)
@@ -458,3 +485,26 @@ def test_a_ros2_bridge_sends_nothing_to_an_arm_with_another_tool(
         tick()
         assert hasattr(node, "sent") == (off == 0.0)
     assert "check that the policy is of this arm" in node.arm.reason
+
+
+def test_a_start_that_is_refused_is_said_and_waited_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As of a ball that is not over the paddle, or of none."""
+    world, said = World(), []
+    bridge = ros_bridge(monkeypatch, world, said)
+    rests_at = load_policy("robust").metadata.default_joint_angles
+    node = bridge["Bridge"](load_policy("robust"), list(rests_at), {"box": BOX}, "base")
+    ((_, tick),) = node.timers
+    for count in range(100):
+        header = message(stamp=stamp_of(1.0 + 0.002 * count), frame_id="base")
+        still = {"position": list(rests_at), "velocity": [0.0] * 6}
+        node.subscribed["/joint_states"](message(header=header, name=world.names, **still))
+        if count == 90:
+            node.subscribed["/start"](message())
+        if count > 90:
+            point = message(x=0.6, y=0.6, z=0.4)
+            node.subscribed["/ball"](message(point=point, header=header))
+        tick()
+    assert node.arm.state == "ready"
+    node.subscribed["/start"](message())
+    assert node.arm.state == "ready"
+    assert "no picture of the ball" in said[0] and "0.6 m beside" in said[1]

@@ -49,6 +49,8 @@ class Bus:
         self.rate = rate
         self.size = size
         self.depths = deque(depths)
+        self.lost: set[tuple[int, int]] = set()
+        """Cameras, 0 and 1, and the numbers of the exposures that each loses."""
         self.pictures = None
         """What each camera sees; None for a picture with the number of its exposure."""
         monkeypatch.setattr(
@@ -75,6 +77,8 @@ class Device:
         self.bus = bus
         self.source = source
         self.depth = depth
+        self.place = 1 - len(bus.depths)
+        """0 for the first camera."""
         self.queue: deque[int] = deque()
         self.next = 0
 
@@ -86,14 +90,15 @@ class Device:
 
     def _fill(self) -> None:
         while self.bus.arrival(self.next) <= self.bus.now + 1e-12:
-            if len(self.queue) < self.depth:
+            is_lost = (self.place, self.next) in self.bus.lost
+            if len(self.queue) < self.depth and not is_lost:
                 self.queue.append(self.next)
             self.next += 1
 
     def grab(self) -> bool:
         self._fill()
         self.bus.now += 50e-6
-        if not self.queue:
+        while not self.queue:
             self.bus.now = max(self.bus.now, self.bus.arrival(self.next))
             self._fill()
         self.grabbed = self.queue.popleft()
@@ -128,6 +133,32 @@ def test_a_picture_has_the_time_of_its_exposure_however_slow_the_program_is(
         assert taken == pytest.approx(bus.middle(first), abs=2e-3)
         last = first
         bus.now += work
+
+
+@pytest.mark.parametrize("work", [0.0, 0.010])
+@pytest.mark.parametrize("lost", [{0: (90,)}, {1: (90,)}, {0: (90,), 1: (91,)}, {1: (90, 91)}])
+def test_a_lost_picture_of_one_camera_leaves_pairs_of_one_exposure(monkeypatch, lost, work) -> None:
+    bus = Bus(monkeypatch)
+    bus.lost = {(place, number) for place in lost for number in lost[place]}
+    capture = Capture(["0", "1"], SIZE, 60.0, EXPOSURE, TRANSPORT)
+    seen = []
+    while not seen or seen[-1] < 120:
+        pictures, taken = capture.read()
+        first, second = (number_of(picture) for picture in pictures)
+        assert first == second
+        assert taken == pytest.approx(bus.middle(first), abs=2e-3)
+        seen.append(first)
+        bus.now += work
+    assert min(seen) < 85 and len(seen) > 120 - min(seen) - 6
+
+
+def test_a_camera_straight_above_its_gaze_has_x_at_the_top() -> None:
+    camera = rough_camera((0.6, 0.0, 2.0), (0.6, 0.0, 0.5), SIZE, 60.0)
+    ahead = camera.project(np.array([0.7, 0.0, 0.5]))[0]
+    middle = camera.project(np.array([0.6, 0.0, 0.5]))[0]
+    left = camera.project(np.array([0.6, 0.1, 0.5]))[0]
+    np.testing.assert_allclose(middle, [320.0, 240.0], atol=1e-9)
+    assert ahead[1] < middle[1] - 10.0 and left[0] < middle[0] - 10.0
 
 
 def test_a_fast_program_gets_every_picture(monkeypatch) -> None:

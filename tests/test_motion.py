@@ -1460,3 +1460,26 @@ def test_a_fall_with_noise_and_a_push_is_one(rate: float, push: float) -> None:
         places[:, 0] += push * np.cos(angle) * since
         places[:, 1] += push * np.sin(angle) * since
         assert fit_fall(times, places, noise=0.008, push=push).ratio <= 1.0
+
+
+def test_missed_steps_have_the_velocity_between_the_last_pictures(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Of a policy whose velocities are differences; none in which the ball stood still."""
+    policy = changed_policy("track", velocity="differences")
+    network = policy.controller.network
+    newest = network._newest
+    seen = []
+
+    def recorded(*arguments: Any) -> Any:
+        values = newest(*arguments)
+        seen.append(values["ball_velocity"][2])
+        return values
+
+    monkeypatch.setattr(network, "_newest", recorded)
+    for step in (0, 1, 2, 6, 7):
+        ball = [0.589, 0.0, 0.9 - 0.01 * step]
+        given = measured(ball_position=ball, time=0.01 * step, target_x=0.589, target_y=0.0)
+        del given["ball_velocity"]
+        policy.step(given)
+    np.testing.assert_allclose(seen[1:], -1.0, atol=1e-9)

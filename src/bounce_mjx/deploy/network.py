@@ -120,6 +120,7 @@ class OnnxNetwork:
         view = history.view
         if self.metadata.velocity == "differences" and picture is not None:
             view = self._look(view, picture)
+        if self.metadata.velocity == "differences" and view is not None:
             measured = measured | {"ball_velocity": view.velocity}
         newest = self._newest(measured, action)
         rows = {name: _zeros(entry) for name, entry in self._inputs.items()}

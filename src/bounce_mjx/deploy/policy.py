@@ -180,7 +180,7 @@ class DeployedPolicy:
         return self._memory.seen.clock.step
 
     def servo_targets(self, action: np.ndarray) -> np.ndarray:
-        """Sends an action [J] in the last step: its servo targets [J] (rad). They are the joint
+        """Takes an action [J] for the last step's: its servo targets [J] (rad). They are the joint
         angles measured in that step plus the scaled action, clipped to `metadata.largest_step` from
         the last targets and to the joint ranges. With `metadata.max_lead`, the action adds to the
         last targets, within that distance of the measured angles. With `metadata.limits`, they are

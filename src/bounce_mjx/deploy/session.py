@@ -9,6 +9,7 @@ import numpy as np
 from bounce_mjx.deploy.faults import picture_age
 from bounce_mjx.deploy.policy import DeployedPolicy
 from bounce_mjx.deploy.recorder import Recorder
+from bounce_mjx.deploy.supervisor import Supervisor
 from bounce_mjx.deploy.trajectory import Trajectory
 from bounce_mjx.errors import UserError
 
@@ -68,6 +69,33 @@ class Session(NamedTuple):
     """Why it ended, or what it still waited for."""
 
 
+def heed_word(supervisor: Supervisor, ball_age: float, max_age: float) -> str | None:
+    """What the operator's word does: it starts an episode where the arm is ready, and sends it home
+    where it has stopped. Without a word, neither moves.
+
+    Args:
+      supervisor: of the arm.
+      ball_age: of the newest picture of the ball, s.
+      max_age: largest one with which an episode starts, s.
+
+    Returns:
+      Why nothing has begun, to be said; the arm rests on. None if it has.
+    """
+    if supervisor.state == "stopped":
+        supervisor.restart()
+        return None
+    if supervisor.state != "ready":
+        return f"the arm is {supervisor.state}"
+    if not ball_age <= max_age:
+        return f"no picture of the ball is newer than {max_age:g} s"
+    try:
+        supervisor.start()
+    except UserError as error:
+        # The ball is not over the paddle.
+        return str(error)
+    return None
+
+
 def play(
     policy: DeployedPolicy,
     arm: Arm,
@@ -93,7 +121,7 @@ def play(
       UserError: the arm is measured elsewhere than its controller holds it, or the settings do not
         fit; whatever is raised, the arm is stopped first.
     """
-    # Where the controller holds the arm, which no reading of ours can be wrong about.
+    # Where the controller holds the arm, which no reading of the encoders tells wrongly.
     policy.reset(arm.targets())
     supervisor = policy.supervise(arm.rate, **box)
     dt = policy.metadata.control_dt
@@ -117,15 +145,9 @@ def play(
             has_word = is_told(supervisor.state)
             reason = supervisor.reason
             if supervisor.state == "ready" and has_word:
-                if measured.get("ball_age", np.inf) > max_age:
-                    reason = f"no picture of the ball is newer than {max_age:g} s"
-                    continue
-                try:
-                    supervisor.start()
+                reason = heed_word(supervisor, measured.get("ball_age", np.inf), max_age)
+                if reason is None:
                     start = measured["time"]
-                except UserError as error:
-                    # The ball is not over the paddle: the arm goes on resting at home.
-                    reason = str(error)
             elif supervisor.state == "stopped" and stopped_at is None:
                 stopped_at = measured["time"]
                 if start is not None:

@@ -39,8 +39,7 @@ _SETTLING = 1.0
 # What the first angles may be off the start pose, where nobody says where the arm rests, beside the
 # noise of a start, rad.
 _NEAR = 0.1
-# Horizontal distance of a ball from the paddle's centre at which it is over the paddle, beside what
-# the training started with, m.
+# Horizontal distance of a ball from the paddle's centre at which it is over the paddle, m.
 _OVER = 0.15
 # Measured of the arm alone.
 _OF_ARM = ("joint_angles", "time", "joint_targets", "tool_position", "tool_normal")
@@ -66,7 +65,7 @@ class Progress(NamedTuple):
     """Whether the arm has been measured where its commands rest; nothing is sent before, nor once
     a stopped arm is elsewhere."""
     has_begun: bool = False
-    """Whether there was a command."""
+    """Whether there was a command, or it is said where the arm rests: nothing is raised then."""
     target: Target = Target()
     """The controller's own, before the arm was found."""
     followed: Followed | None = None

@@ -52,10 +52,15 @@ class Camera(NamedTuple):
         return float(self.matrix[0, 0] * RADIUS / max(depth, 0.05))
 
 
+# Sine of an angle to the vertical at which a horizon is not level, but unknown.
+_VERTICAL = 1e-6
+
+
 def rough_camera(
     place: Sequence[float], gaze: Sequence[float], size: tuple[int, int], field_of_view: float
 ) -> Camera:
-    """A camera with a level horizon, measured with a tape.
+    """A camera with a level horizon, measured with a tape; the pictures of one straight above its
+    gaze have x at the top.
 
     Args:
       place: of the camera [3], m, in the robot's frame.
@@ -67,6 +72,8 @@ def rough_camera(
     forward = np.array(gaze, float) - np.array(place, float)
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, [0.0, 0.0, 1.0])
+    if np.linalg.norm(right) < _VERTICAL:
+        right = np.cross(forward, [1.0, 0.0, 0.0])
     right /= np.linalg.norm(right)
     rotation = np.stack([right, np.cross(forward, right), forward])
     focal_length = 0.5 * width / np.tan(0.5 * np.radians(field_of_view))

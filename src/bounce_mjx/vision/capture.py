@@ -19,6 +19,10 @@ from bounce_mjx.errors import UserError
 _DEVICES = Path("/dev")
 # Links to the cameras of Linux, by the maker's name with a serial number, and by the socket.
 _LINKS = ("v4l/by-id", "v4l/by-path")
+# Shares of a camera's interval: the wait for the second camera within which both pictures are of
+# one exposure, and the time from the last pair beyond which one was lost.
+_TOGETHER = 0.5
+_NEXT = 1.5
 # Share of the time between two pictures for which the program waits at least for one that has just
 # arrived.
 _WAITING = 0.1
@@ -114,6 +118,8 @@ class Capture:
             # A driver may refuse these two, or take them and do otherwise.
             capture.set(cv2.CAP_PROP_FPS, rate)
             capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
+        self._arrived = 0.0
+        """When the last pair arrived, s."""
         self._check_rate()
 
     def read(self) -> tuple[tuple[np.ndarray, ...], float]:
@@ -151,21 +157,29 @@ class Capture:
         Both are grabbed before either is decoded, which takes milliseconds.
         """
         first, second = self._captures
-        if self._grab(first) < self._least_wait:
-            # The program came late, and the two queues may hold different pictures.
+        last = self._arrived
+        is_late = self._grab(first) < self._least_wait
+        has_lost = time.monotonic() - last > _NEXT / self.rate
+        if is_late or has_lost or self._grab(second) > _TOGETHER / self.rate:
+            # The program came late, or a camera lost a picture: the two queues may hold different
+            # ones.
             return self._catch_up()
-        self._grab(second)
-        return time.monotonic()
+        self._arrived = time.monotonic()
+        return self._arrived
 
     def _catch_up(self) -> float:
         """Empties both queues, and grabs the next pair: its time, s."""
-        first, second = self._captures
-        self._empty(first)
-        self._empty(second)
-        # The first camera's picture of this instant is there as well, unless it came before.
-        if self._grab(first) > 0.5 / self.rate:
-            self._grab(second)
-        return time.monotonic()
+        behind, ahead = self._captures
+        self._empty(behind)
+        self._empty(ahead)
+        # The other camera's picture of this instant is there as well, unless it came before or was
+        # lost: then it has the next one.
+        for _ in range(_QUEUED):
+            if self._grab(behind) <= _TOGETHER / self.rate:
+                break
+            behind, ahead = ahead, behind
+        self._arrived = time.monotonic()
+        return self._arrived
 
     def _empty(self, capture: cv2.VideoCapture) -> None:
         """Grabs pictures until one arrives."""
