@@ -210,6 +210,7 @@ def test_the_log_of_a_motion_shows_the_worlds_delay(tmp_path, monkeypatch, capsy
         (["robust", "--fault", "camera:1"], "the fault camera is not of a joint; give camera"),
         (["robust", "--motion", "x.csv"], "--motion is for an arm without a policy; leave it out"),
         (["a.yaml", "--robot", "ur5e"], "a.yaml and --robot ur5e are two arms; give one"),
+        (["robust", "--film", "day.mpeg"], "--film day.mpeg must end with .mp4, .webp, .gif"),
     ],
 )
 def test_a_mistake_is_one_sentence(words, error, capsys) -> None:

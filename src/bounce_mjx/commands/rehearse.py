@@ -71,6 +71,7 @@ def main(args: Sequence[str]) -> None:
     """Runs the command line; exits with 1 if the arm stopped without a fault, and with 2 on a
     mistake."""
     command, given_goals = parse_with_goals(RehearseCommand, args, prog=_PROG)
+    _check_film(command)
     is_arm = command.policy is not None and command.policy.suffix in _YAML
     if is_arm and command.robot is not None:
         raise UserError(f"{command.policy} and --robot {command.robot} are two arms; give one")
@@ -102,8 +103,9 @@ def _rehearse_policy(command: RehearseCommand, given_goals: GivenGoals) -> None:
         session = play(
             policy, arm, command.seconds, arm.is_told, goals, {"box": tuple(box)}, recorder
         )
-    _film(command, config, arm, goals)
     _tell(command, session, arm)
+    _film(command, config, arm, goals)
+    _exit_with_status(command, session)
 
 
 def _policy_file(command: RehearseCommand) -> Path:
@@ -207,23 +209,31 @@ def _log(
     return Recorder(command.log, names, units, balls)
 
 
+def _check_film(command: RehearseCommand) -> None:
+    """Refuses the name of a film that cannot be written, before the rehearsal."""
+    if command.film is None:
+        return
+    from bounce_mjx.viewers.video import SUFFIXES
+
+    if command.film.suffix.lower() not in SUFFIXES:
+        raise UserError(f"--film {command.film} must end with {', '.join(SUFFIXES)}")
+
+
 def _film(command: RehearseCommand, config: "WorldConfig", arm: "SimulatedArm", goals: Any) -> None:
     """Writes the film, if there is to be one."""
     if command.film is None:
         return
     from bounce_mjx.env.env import Env
     from bounce_mjx.rehearsal.film import pictures
-    from bounce_mjx.viewers.video import SUFFIXES, VideoWriter
+    from bounce_mjx.viewers.video import VideoWriter
 
-    if command.film.suffix.lower() not in SUFFIXES:
-        raise UserError(f"--film {command.film} must end with {', '.join(SUFFIXES)}")
     writer = VideoWriter(command.film, _SIZE, None)
     writer.write_pictures(pictures(Env(config), arm.path, goals, _SIZE, writer.fps))
     print(f"film: {command.film}")
 
 
 def _tell(command: RehearseCommand, session: "Session", arm: "SimulatedArm") -> None:
-    """Prints what happened; exits with 1 if the arm stopped without a fault."""
+    """Prints what happened."""
     for number, episode in enumerate(session.episodes, start=1):
         bounces = arm.bounces_in(episode.start, episode.seconds)
         end = "until the end"
@@ -237,6 +247,10 @@ def _tell(command: RehearseCommand, session: "Session", arm: "SimulatedArm") -> 
         print(f"no episode began: {session.reason}")
     if command.log is not None:
         print(f"log: {command.log}")
+
+
+def _exit_with_status(command: RehearseCommand, session: "Session") -> None:
+    """Exits with 1 if the arm stopped without a fault that was asked for."""
     has_stopped = any(episode.fault for episode in session.episodes)
     if not session.episodes or (has_stopped and command.fault is None):
         sys.exit(1)
