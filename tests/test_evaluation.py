@@ -4,7 +4,6 @@ import functools
 import io
 import itertools
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import jax
@@ -349,30 +348,6 @@ def test_c_evaluates_each_episode_in_its_own_world(networks, random_policy):
     )
     assert len(episode_models(BounceBall(config), PhysicsParameters())) == 1
     assert all(model.opt.disableflags & AUTORESET for model in models)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("air_drag", [None, (0.1, 0.5)])
-def test_a_ball_that_grips_moves_the_same_on_both_engines(networks, random_policy, air_drag):
-    """On C, steps in which a ball flies are MuJoCo's own, and those of a contact have friction."""
-    worlds = {"contact_friction": (0.3, 0.5)}
-    if air_drag is not None:
-        worlds["air_drag"] = air_drag
-    env = BounceBall(
-        EnvConfig(episode_seconds=0.5, ball_init_pos=(TARGET_X, 0.0, 0.2), randomization=worlds)
-    )
-    key = jax.random.key(3)
-
-    def balls(make: Callable) -> np.ndarray:
-        """Their places [T, 3, K], before the first episode ends."""
-        recording = make(env, networks, 6, recorded=6)(random_policy, key)[1]
-        last = int(np.argmin(np.all(recording.running, axis=1))) - 1
-        return np.array(recording.ball[:last])
-
-    on_c = balls(make_mujoco_evaluator)
-    fused = balls(make_evaluator)
-    # Without friction they end 1 mm and more away.
-    np.testing.assert_allclose(on_c, fused, rtol=0, atol=1e-5)
 
 
 @pytest.mark.slow

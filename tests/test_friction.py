@@ -401,6 +401,7 @@ def test_a_plain_mj_step_has_another_friction():
 # Evaluation on C
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("drawn", [False, True], ids=["one world", "a world each"])
 def test_the_evaluation_on_c_has_the_friction_of_the_engine(drawn):
     """Over control steps with a bounce, the drag of the air and pushes, each up to the rounding of
@@ -567,6 +568,7 @@ def test_the_gradient_of_friction_is_that_of_finite_differences(float64):
     assert np.all(np.abs(found[1, :12]) > 1e-6)
 
 
+@pytest.mark.slow
 def test_gradients_are_finite_at_the_edges_of_friction():
     """Without slip, with hardly any, without contact, without friction; in float32 as shipped."""
     step = make_engine(frictional(), "fused").step

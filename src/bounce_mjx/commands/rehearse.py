@@ -6,8 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
-
 from bounce_mjx.commands.goals import GivenGoals, parse_with_goals
 from bounce_mjx.commands.which_policy import OtherWorld, WhichPolicy
 from bounce_mjx.config.command_line import Flag
@@ -84,6 +82,8 @@ def main(args: Sequence[str]) -> None:
 def _rehearse_policy(command: RehearseCommand, given_goals: GivenGoals) -> None:
     if command.motion is not None:
         raise UserError("--motion is for an arm without a policy; leave it out, or give --robot")
+    import numpy as np
+
     from bounce_mjx.deploy.loading import load_policy
     from bounce_mjx.deploy.motion import paddle_position
     from bounce_mjx.deploy.session import play

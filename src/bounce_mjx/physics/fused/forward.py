@@ -189,9 +189,10 @@ def servo_force(
     force limit. The limit of the joint does not change MuJoCo's derivative."""
     if servo.ctrl_range is not None:
         target = jnp.clip(target, *servo.ctrl_range)
-    force = dot((servo.gain, servo.stiffness, servo.damping), (target, q, v))
+    coefficients = servo.gain, servo.force_per_position, servo.force_per_velocity
+    force = dot(coefficients, (target, q, v))
     force = add(force, servo.bias)
-    derivative = servo.damping
+    derivative = servo.force_per_velocity
     if servo.force_range is not None:
         least, most = servo.force_range
         is_within = (force > least) & (force < most)
@@ -246,7 +247,7 @@ def integrate(
     for i, link in enumerate(model.links):
         damping = link.damping if model.implicit_damping else 0.0
         if model.implicit_servos:
-            # The derivative of a servo's force is minus its damping.
+            # A damper's force per velocity is minus its damping.
             damping = sub(damping, actuation.derivative[i])
         implicit_matrix[i][i] = add(implicit_matrix[i][i], mul(damping, model.dt))
     implicit_factor = keep(chain.cholesky(implicit_matrix))

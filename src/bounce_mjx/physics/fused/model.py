@@ -52,15 +52,15 @@ class Frame(NamedTuple):
 class Servo:
     """A servo. On a joint with position q and velocity v it exerts, in N m or N,
 
-    gain * ctrl + bias + stiffness * q + damping * v
+    gain * ctrl + bias + force_per_position * q + force_per_velocity * v
 
-    As in MuJoCo's `biasprm`, stiffness and damping of a servo that holds are negative: -kp and -kv.
+    The last two are those of MuJoCo's `biasprm`: -kp and -kv for a servo that holds.
     """
 
     gain: Scalar
     bias: Scalar
-    stiffness: Scalar
-    damping: Scalar
+    force_per_position: Scalar
+    force_per_velocity: Scalar
     ctrl_range: tuple[Scalar, Scalar] | None
     """Range to which ctrl is clipped; None for none."""
     force_range: tuple[Scalar, Scalar] | None = None
@@ -378,7 +378,7 @@ def _apply_flag(same: int, frame: Frame, inertial: Frame) -> Frame:
 def _read_servo(model: EditedModel, actuator: int, joint: int) -> Servo:
     mj_model = model.mj_model
     gear = float(mj_model.actuator_gear[actuator, 0])
-    bias, stiffness, damping = model["actuator_biasprm", actuator, :3]
+    bias, per_position, per_velocity = model["actuator_biasprm", actuator, :3]
     ctrl_range = None
     if mj_model.actuator_ctrllimited[actuator]:
         ctrl_range = model["actuator_ctrlrange", actuator]
@@ -392,8 +392,8 @@ def _read_servo(model: EditedModel, actuator: int, joint: int) -> Servo:
     return Servo(
         gain=mul(model["actuator_gainprm", actuator, 0], gear),
         bias=mul(bias, gear),
-        stiffness=mul(stiffness, gear**2),
-        damping=mul(damping, gear**2),
+        force_per_position=mul(per_position, gear**2),
+        force_per_velocity=mul(per_velocity, gear**2),
         ctrl_range=ctrl_range,
         force_range=force_range,
         joint_range=joint_range,
