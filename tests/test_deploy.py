@@ -249,7 +249,9 @@ def test_an_operation_without_a_counterpart_is_named(rows) -> None:
             graph_of(function, rows)
 
 
-@pytest.mark.parametrize("name", ["specification", "pretrained"])
+@pytest.mark.parametrize(
+    "name", [pytest.param("specification", marks=pytest.mark.slow), "pretrained"]
+)
 def test_onnx_equals_jax(name: str, runs: dict[str, Path]) -> None:
     inputs, expected = draw_inputs(name, runs)
     given = {input_name(quantity): values for quantity, values in inputs.items()}

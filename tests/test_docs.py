@@ -454,7 +454,7 @@ def short_training(folder: Path) -> Callable:
 EXCERPTS = {"tasks.md": "examples/dribble_task.py", "tutorial.md": "examples/line_task.py"}
 
 # test_examples.py and test_deploy.py run the most of real-robot.md.
-SLOW_PAGES = "libraries.md", "real-robot.md", "training.md"
+SLOW_PAGES = "../README.md", "libraries.md", "real-robot.md", "training.md"
 
 
 @pytest.mark.parametrize(

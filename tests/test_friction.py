@@ -521,6 +521,7 @@ def test_friction_that_a_frictionless_model_only_names_is_allowed():
 # Gradients
 
 
+@pytest.mark.slow
 def test_the_gradient_of_friction_is_that_of_finite_differences(float64):
     """From states that stick and slip, with respect to the state, the coefficient and the ball's
     inertia, away from the limit between the two."""

@@ -47,7 +47,7 @@ def _handle(number: int, handler: Any) -> Any:
 
 class StopRequest:
     """While entered in the main thread, the first signal only sets `requested`; a later SIGINT or
-    SIGTERM goes to the handler before, such as a notebook's, or ends the process at once."""
+    SIGTERM goes to the handler before, such as a notebook's, and then ends the process at once."""
 
     def __init__(self) -> None:
         self._requested_at: float | None = None

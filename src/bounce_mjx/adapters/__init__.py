@@ -1,4 +1,5 @@
-"""The environment with the interfaces of other libraries. Each wraps one `Env`, its `core`:
+"""The environment with the interfaces of other libraries. Each wraps one `Env`, its `core`, which
+`bounce_mjx.environment` makes; one around another class has it there:
 
 | library | class | in |
 |---|---|---|

@@ -81,6 +81,7 @@ def main(args: Sequence[str] | None = None) -> None:
             # A robot's computer has no pydantic: doctor, which runs there, needs no code of a user.
             command.main(rest)
             return
-        # The user's own tasks and algorithms, which then have names.
+        # The user's own tasks and algorithms, which then have names. The two words before the rest
+        # are for the command line that an error advises.
         _, _, *words = run_imports(["bounce-mjx", name, *rest])
         command.main(words)

@@ -20,8 +20,8 @@ def main(args: Sequence[str]) -> None:
         if has_plugin() != has_accelerator():
             command = read_command(args)
         config = command.config
-        # A config that training refuses is no answer; what the devices and the robot's file allow
-        # is seen only as it starts.
+        # A training's own checks, so that no config is shown that it refuses; what the devices and
+        # the robot's file allow is seen only as it starts.
         config.ppo.check_rollout(config.training_episode_steps)
         config.check_eval_seed()
         remarks = dict(config.sources)
@@ -49,6 +49,7 @@ def main(args: Sequence[str]) -> None:
             # JAX must not be asked for its devices before.
             numbers = flags.num_processes, flags.process_id, flags.host_timeout
             hosts.join(flags.coordinator_address, *numbers)
+        # Which preset is the default depends on the devices, of several hosts known only now.
         if flags.on_several_hosts or has_plugin() != has_accelerator():
             command = read_command(args)
         config = command.config

@@ -175,7 +175,8 @@ class PPO(Algorithm):
 
     @classmethod
     def make_trainer(cls, config: Any, env: Any) -> None:
-        """None, for the trainer of this package, which runs the two functions on each device."""
+        """None: `training.ppo_trainer`, which this package may not import, trains with `init` and
+        `run` on each device."""
 
     def __init__(self, config: PPOConfig, env: AnyEnv, episode_steps: int):
         """

@@ -240,8 +240,8 @@ def is_newest(path: Path | None) -> bool:
 
 
 def run_or_newest(path: Path | None, log_dir: Path) -> Path:
-    """A run's folder or a path in it, as the user named it; in place of `is_newest`, the newest run
-    with a checkpoint in `log_dir`."""
+    """A run's folder or a path in it, as the user named it; where it names none (`is_newest`), the
+    newest run with a checkpoint in `log_dir`."""
     if not is_newest(path):
         return path
     if not (found := runs_in(log_dir)):

@@ -59,8 +59,8 @@ class ChoiceFlags(StrictModel):
 
     config: Annotated[tuple[Path, ...], Flag(metavar="NAME|FILE", is_repeated=True)] = ()
     """Preset, such as cpu or finetune (a YAML file in configs/), or a YAML file of yours. A task's
-    own preset of that name, such as configs/track/cpu.yaml, has priority. The default is default on
-    an accelerator, and cpu on a CPU. A file of yours lies on that default, or on the preset that
+    own preset of that name, such as configs/track/cpu.yaml, takes its place. The default is default
+    on an accelerator, and cpu on a CPU. A file of yours lies on that default, or on the preset that
     its key base names. Given again, each file lies on those before it."""
     robot: Annotated[Path | None, Flag(metavar="NAME|FILE")] = None
     """Config of a robot on top of the preset: the file that bounce-mjx adopt wrote, or the name of
@@ -295,7 +295,7 @@ class Layers:
         for layer in layers:
             self._check_groups(layer)
         values, sources = _merge(layers)
-        # One that extends the task of a warm start.
+        # As the word says it, also where a warm start is of the task that this one extends.
         values["task"] = self.start.task_name
         try:
             config = self._validated(values)
@@ -407,7 +407,8 @@ def _merge(layers: Sequence[Layer]) -> tuple[dict[str, Any], dict[str, str]]:
             randomization = without_idle_curriculum(values["env"]["randomization"])
             values["env"] = values["env"] | {"randomization": randomization}
         for key in flat(layer.values):
-            # The last source of its keys is that of a mapping (`TrainConfig.sources`).
+            # Put last, as the last source among a mapping's keys is the mapping's
+            # (`TrainConfig.sources`).
             sources.pop(key, None)
             sources[key] = layer.source
     # A later layer may end a value, or replace a mapping by None.

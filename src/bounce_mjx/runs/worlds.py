@@ -20,7 +20,7 @@ from bounce_mjx.world.named import CURRICULUM, NamedWorld, read_world
 from bounce_mjx.world.randomization import RandomizationConfig
 
 AS_TRAINED = None
-"""World: each that a policy's training sampled, as it did; a task's own."""
+"""World: each that a policy's training sampled, as it did; of a task, that of its defaults."""
 TRAINING = "training"
 """World: each that a policy's training sampled, without its curriculum."""
 NOMINAL = "nominal"
@@ -46,7 +46,7 @@ def env_in_world(
     start: type[Task] | WorldConfig, world: World, robot: Path | None = None
 ) -> WorldConfig:
     """The environment of a task, or of a policy's training with its observation and its actions, in
-    a world. Each caller says the world: a training and its measurements are `AS_TRAINED` unless the
+    a world. Each caller says the world: what measures a policy is `AS_TRAINED` unless the
     user names another one; the environment that a user asks for by its policy is `NOMINAL`.
 
     Args:

@@ -96,7 +96,7 @@ def read_command(args: Sequence[str], machine: Path | None = None) -> TrainComma
     _refuse_flags_of_the_word(words)
     word, after_word = _split_word(words)
     flags_of_choice = parse(ChoiceFlags, after_word, prog=PROG, is_first=True)
-    # From here on, the words are a typed value.
+    # What decides which layers there are; the layers then say which other flags there are.
     choice = Choice(start=word, **dict(flags_of_choice))
     layers = read_layers(choice, machine)
     fields = fields_of_command(layers)

@@ -2,7 +2,8 @@
 
 Every process runs the same program on its shard of the environments. Only the leader calls the
 callbacks and writes; the others learn what it has decided (`exchange`), and send their shards of
-the state. All of them read: a run that is resumed, or a warm start, lies where each host finds it.
+the state (`PPOTrainer`). All of them read: a run that is resumed, or a warm start, lies where each
+host finds it.
 """
 
 import contextlib

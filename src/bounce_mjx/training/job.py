@@ -271,8 +271,8 @@ class Job:
                     self.say(f"the damaged checkpoint is kept as {aside}")
 
     def write_configs(self) -> None:
-        """Writes the config of the run, which has changed where it is resumed with more steps, and
-        that of each seed."""
+        """Makes the folders of the seeds, and writes the config of each and of the run, which has
+        changed where it is resumed with more steps."""
         if not hosts.is_leader():
             return
         for folder, config in self.configs_by_folder().items():
@@ -357,7 +357,7 @@ class Job:
             return
         seconds = sum(self.clock.seconds.values())
         # Before the reports are added, as a save that has failed sets back the best policy.
-        self.saver.end()
+        self.saver.collect()
         self.clock.lap("save")
         told = []
         for seed, report, policy in zip(self.seeds, reports, policies, strict=True):
@@ -383,7 +383,7 @@ class Job:
     def save(self) -> None:
         """Starts to save the state, and with several seeds the policies that are the best of their
         seed."""
-        self.saver.end()
+        self.saver.collect()
         self.saver.start(self.take_snapshot(), self.steps, self.about())
         self.needs_save = False
         self.clock.lap("save")
@@ -500,7 +500,7 @@ class Job:
         Raises:
           UserError: it failed.
         """
-        problem = self.saver.end(is_last=True)
+        problem = self.saver.collect(is_last=True)
         self.clock.lap("save")
         if problem:
             raise UserError(
@@ -667,7 +667,7 @@ class Job:
                 self.say(f"seed {seed.config.seed} diverged: {seed.progress.fault}")
         if diverged:
             # The results of the other seeds may now end the training: those that are saved.
-            self.saver.end()
+            self.saver.collect()
         if not self.healthy():
             raise UserError(
                 f"training diverged: {self.seeds[-1].progress.fault}; the last good checkpoint is "

@@ -99,7 +99,7 @@ class Saver:
         if self._saving is not None:
             concurrent.futures.wait([self._saving])
 
-    def end(self, is_last: bool = False) -> str | None:
+    def collect(self, is_last: bool = False) -> str | None:
         """Waits for the save that was started last, and tells the seeds what it has written.
 
         Args:
@@ -160,10 +160,10 @@ class Saver:
 
     def _earlier(self) -> frozenset[int]:
         """The checkpoints that stay beside the one that is written next, by number."""
-        kept = self._config.keep_checkpoints
-        if kept == "all":
+        count = self._config.keep_checkpoints
+        if count == "all":
             return frozenset(self._written)
-        first = max(0, len(self._written) - (kept - 1))
+        first = max(0, len(self._written) - (count - 1))
         return frozenset(self._written[first:])
 
     def _save_of(

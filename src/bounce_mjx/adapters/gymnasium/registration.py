@@ -5,7 +5,7 @@ import gymnasium
 from bounce_mjx.resources import TASK_POLICIES
 
 ENV_ID = "bounce_mjx/BounceBall-v0"
-"""Name of the specification's environment."""
+"""Name of the default task's environment."""
 TASK_ID = "bounce_mjx/Task-v0"
 """Name of any other one, with the argument `task` or `policy`."""
 TASKS = TASK_POLICIES
