@@ -36,8 +36,10 @@ from bounce_mjx import load_policy
 from bounce_mjx.deploy.motion import paddle_position
 from bounce_mjx.errors import UserError
 from bounce_mjx.physics import CEngine
+from bounce_mjx.rehearsal import faults as inject
+from bounce_mjx.rehearsal.faults import Act, Moment
 from bounce_mjx.resources import POLICIES, resource_path
-from bounce_mjx.robot.model import BALLS_APART, find_addresses
+from bounce_mjx.robot.model import balls_above, find_addresses
 from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.world.model import world_model
 
@@ -55,10 +57,6 @@ FIRST_COMMAND = 0.02
 """What the first command may be off the arm, rad."""
 OVERSHOOT = 0.02
 """What the arm may be off the box, m."""
-COUNT = 2.0 * math.pi / 4096.0
-"""A coarse encoder's count, rad."""
-DRY_FRICTION = 5e-4
-"""Angle between a servo's target and its joint that dry friction holds, rad."""
 
 
 class Sensors(NamedTuple):
@@ -94,8 +92,7 @@ def _throw_of(name: str) -> tuple[np.ndarray, np.ndarray]:
     thrown = task.throw(jnp.full(task.num_draws, 0.5), goal)
     if thrown is not None:
         return tuple(np.asarray(x, float).reshape(-1, 3) for x in thrown)
-    above = BALLS_APART * np.arange(env.num_balls)[:, None] * [0.0, 0.0, 1.0]
-    return np.array(env.ball_init_pos) + above, np.zeros((env.num_balls, 3))
+    return balls_above(env.ball_init_pos, env.num_balls), np.zeros((env.num_balls, 3))
 
 
 class Robot:
@@ -151,6 +148,14 @@ class Robot:
     def paddle(self) -> np.ndarray:
         return self.data.geom_xpos[self.paddle_geom].copy()
 
+    @property
+    def picture_time(self) -> float:
+        return self.newest[0]
+
+    @property
+    def picture_noise(self) -> float:
+        return self.sensors.noise
+
     def measure(self) -> dict[str, Any]:
         """What the robot's program knows."""
         time = self.data.time
@@ -198,21 +203,6 @@ class Robot:
             self.pictures.append((self.data.time, np.squeeze(places + noise)))
 
 
-class Moment(NamedTuple):
-    """A control step in which a fault is there."""
-
-    robot: Robot
-    measured: dict[str, Any]
-    """May be changed."""
-    first: dict[str, Any]
-    """Measured when the fault came."""
-    time: float
-    """Since the fault came, s."""
-
-
-Act = Callable[[Moment], Any]
-
-
 class Fault(NamedTuple):
     """A fault, and what the supervisor does."""
 
@@ -235,113 +225,9 @@ class Fault(NamedTuple):
     """Whether no command can keep the arm in the box."""
 
 
-def _put(name: str, value: Callable[[Moment], Any]) -> Act:
-    def act(moment: Moment) -> None:
-        moment.measured[name] = value(moment)
-
-    return act
-
-
-def _angle(joint: int, change: Callable[[Moment, float], float]) -> Act:
-    def act(moment: Moment) -> None:
-        angles = moment.measured["joint_angles"]
-        angles[joint] = change(moment, angles[joint])
-
-    return act
-
-
-def _off(joint: int, distance: float) -> Act:
-    """A joint measured at a distance (rad)."""
-    return _angle(joint, lambda moment, angle: angle + distance)
-
-
-def _drift(joint: int, speed: float) -> Act:
-    """An encoder that goes away (rad/s)."""
-    return _angle(joint, lambda moment, angle: angle + speed * moment.time)
-
-
-def _frozen_encoder(joint: int) -> Act:
-    return _angle(joint, lambda moment, angle: moment.first["joint_angles"][joint])
-
-
-def _swapped(first: int, second: int) -> Act:
-    """Two joints measured in each other's place."""
-
-    def act(moment: Moment) -> None:
-        for name in ("joint_angles", "joint_velocities"):
-            values = moment.measured[name]
-            values[[first, second]] = values[[second, first]]
-
-    return act
-
-
-def _flipped(joint: int) -> Act:
-    """A joint measured with another sign."""
-
-    def act(moment: Moment) -> None:
-        for name in ("joint_angles", "joint_velocities"):
-            moment.measured[name][joint] *= -1.0
-
-    return act
-
-
-def _dead(joint: int) -> Act:
-    def act(moment: Moment) -> None:
-        moment.robot.is_dead[joint] = True
-
-    return act
-
-
-def _weak(torque: float) -> Act:
-    def act(moment: Moment) -> None:
-        model, servos = moment.robot.model, moment.robot.servos
-        model.actuator_forcelimited[servos] = 1
-        gears = model.actuator_gear[servos, :1]
-        model.actuator_forcerange[servos] = np.array([-torque, torque]) / gears
-
-    return act
-
-
-def _late_commands(moment: Moment) -> None:
-    moment.robot.command_delay = 0.5
-
-
-def _coarse(moment: Moment) -> None:
-    moment.measured["joint_angles"] = COUNT * np.round(moment.measured["joint_angles"] / COUNT)
-
-
-def _dry_friction(moment: Moment) -> None:
-    model, servos = moment.robot.model, moment.robot.servos
-    stiffness = model.actuator_gainprm[servos, 0] * model.actuator_gear[servos, 0] ** 2
-    model.dof_frictionloss[moment.robot.qvel] = DRY_FRICTION * stiffness
-    _coarse(moment)
-
-
-def _ball(change: Callable[[Moment, np.ndarray], Any]) -> Act:
-    return _put("ball_position", lambda moment: change(moment, moment.measured["ball_position"]))
-
-
-def _thrown(speed: float) -> Act:
-    def act(moment: Moment) -> None:
-        for ball in moment.robot.balls:
-            moment.robot.data.qvel[list(ball.qvel[:3])] = (0.0, speed, speed)
-
-    return act
-
-
-def _frozen(name: str) -> Act:
-    return _put(name, lambda moment: moment.first[name])
-
-
-def _no_pictures(moment: Moment) -> None:
-    for name in ("ball_position", "ball_velocity"):
-        moment.measured[name] = moment.first[name]
-    moment.measured["ball_age"] = moment.first["ball_age"] + moment.time
-
-
 def _at_rest(moment: Moment, commands: np.ndarray) -> np.ndarray:
     """The robot rests at the command that it had."""
-    return np.tile(moment.robot.command, (len(commands), 1))
+    return np.tile(moment.arm.command, (len(commands), 1))
 
 
 def _nothing(moment: Moment) -> None:
@@ -364,33 +250,11 @@ def _every_second(moment: Moment) -> None:
 
 
 def _velocities(change: Callable[[np.ndarray], np.ndarray]) -> Act:
-    return _put("joint_velocities", lambda m: change(m.measured["joint_velocities"]))
-
-
-def _held(offset: list[float], speed: float = 0.0) -> Act:
-    """A hand that holds the balls at an offset (m) from where the paddle was, with the noise of
-    the camera in each picture; or carries them sideways."""
-    places: dict[float, np.ndarray] = {}
-
-    def act(moment: Moment) -> None:
-        robot = moment.robot
-        if moment.time == 0.0:
-            places.clear()
-            places[-1.0] = robot.paddle
-        taken = robot.newest[0]
-        if taken not in places:
-            place = places[-1.0] + offset + [0.0, speed * moment.time, 0.0]
-            shape = moment.measured["ball_position"].shape
-            noise = robot.sensors.noise * robot.random.standard_normal(shape)
-            places[taken] = place + noise
-        moment.measured["ball_position"] = places[taken]
-        moment.measured["ball_velocity"] = 0.0 * moment.measured["ball_velocity"]
-
-    return act
+    return inject.put("joint_velocities", lambda m: change(m.measured["joint_velocities"]))
 
 
 def _second_ball(moment: Moment) -> None:
-    if round(moment.robot.newest[0] * moment.robot.sensors.rate) % 2 == 0:
+    if round(moment.arm.picture_time * moment.arm.sensors.rate) % 2 == 0:
         moment.measured["ball_position"] = moment.measured["ball_position"] + [0.0, 0.1, 0.0]
 
 
@@ -412,28 +276,30 @@ def faults(joints: int, policy: str = "robust") -> dict[str, Fault]:
     for joint in (0, 1, 2, joints - 1):
         name = f"joint {joint + 1}"
         for size in (0.3, 1.0, -3.0):
-            found[f"{name}: one sample off by {size} rad"] = Fault(_off(joint, size), steps=1)
-        found[f"{name}: encoder jumps by 0.5 rad"] = Fault(_off(joint, 0.5), JUMP)
+            found[f"{name}: one sample off by {size} rad"] = Fault(inject.off(joint, size), steps=1)
+        found[f"{name}: encoder jumps by 0.5 rad"] = Fault(inject.off(joint, 0.5), JUMP)
         # Its velocities, of another sensor, may contradict it first.
         found[f"{name}: encoder drifts by 0.5 rad/s"] = Fault(
-            _drift(joint, 0.5), (*ARM, *SPEED, "box")
+            inject.drift(joint, 0.5), (*ARM, *SPEED, "box")
         )
-        found[f"{name}: encoder is frozen"] = Fault(_frozen_encoder(joint), ARM, 0.5)
-        found[f"{name}: servo without torque"] = Fault(_dead(joint), ARM, 0.5)
+        found[f"{name}: encoder is frozen"] = Fault(inject.frozen_encoder(joint), ARM, 0.5)
+        found[f"{name}: servo without torque"] = Fault(inject.dead(joint), ARM, 0.5)
     for joint in (1, 2):
-        found[f"joint {joint + 1}: sign flips"] = Fault(_flipped(joint), JUMP)
-    zeros = _put("joint_angles", lambda m: 0.0 * m.measured["joint_angles"])
+        found[f"joint {joint + 1}: sign flips"] = Fault(inject.flipped(joint), JUMP)
+    zeros = inject.put("joint_angles", lambda m: 0.0 * m.measured["joint_angles"])
     found |= {
-        "all joints: encoders of 4,096 counts": Fault(_coarse, from_start=True),
+        "all joints: encoders of 4,096 counts": Fault(inject.coarse, from_start=True),
         "all joints: dry friction, 4,096 counts": Fault(
-            _dry_friction, ("", "ball_lost", "box"), math.inf, from_start=True
+            inject.dry_friction, ("", "ball_lost", "box"), math.inf, from_start=True
         ),
-        "joint 1 and 2 swapped": Fault(_swapped(0, 1), (*JUMP, *ARM)),
-        "joint 2 and 3 swapped": Fault(_swapped(1, 2), (*JUMP, *ARM)),
-        "joint 2 and 3 swapped from the start": Fault(_swapped(1, 2), WAITS, from_start=True),
-        "joint 2 with another sign from the start": Fault(_flipped(1), WAITS, from_start=True),
+        "joint 1 and 2 swapped": Fault(inject.swapped(0, 1), (*JUMP, *ARM)),
+        "joint 2 and 3 swapped": Fault(inject.swapped(1, 2), (*JUMP, *ARM)),
+        "joint 2 and 3 swapped from the start": Fault(inject.swapped(1, 2), WAITS, from_start=True),
+        "joint 2 with another sign from the start": Fault(
+            inject.flipped(1), WAITS, from_start=True
+        ),
         "joint 2: zero off by a quarter turn from the start": Fault(
-            _off(1, 0.5 * math.pi), WAITS, from_start=True
+            inject.off(1, 0.5 * math.pi), WAITS, from_start=True
         ),
         "half of the joints zero from the start": Fault(_half_zero, WAITS, from_start=True),
         "a copy of wrong angles as the target from the start": Fault(
@@ -445,81 +311,95 @@ def faults(joints: int, policy: str = "robust") -> dict[str, Fault]:
         "joint velocities: permuted": Fault(_velocities(lambda v: np.roll(v, 1)), SPEED, 0.5),
         "joint velocities: rpm": Fault(_velocities(lambda v: 9.55 * v), SPEED, 0.5),
         "all joints: degrees": Fault(
-            _put("joint_angles", lambda m: np.degrees(m.measured["joint_angles"])), JUMP
+            inject.put("joint_angles", lambda m: np.degrees(m.measured["joint_angles"])), JUMP
         ),
         "all joints: one sample of zeros": Fault(zeros, steps=1),
         "all joints: zeros": Fault(zeros, JUMP),
         "all joints: first samples are zeros": Fault(zeros, steps=10, from_start=True),
-        "joint 1: first sample is off by 0.5 rad": Fault(_off(0, 0.5), steps=1, from_start=True),
-        "joint 2: first sample is off by 0.25 rad": Fault(_off(1, 0.25), steps=1, from_start=True),
-        "joint 2: first sample is off by 1 rad": Fault(_off(1, 1.0), steps=1, from_start=True),
-        "all joints: frozen": Fault(_frozen("joint_angles"), ARM),
+        "joint 1: first sample is off by 0.5 rad": Fault(
+            inject.off(0, 0.5), steps=1, from_start=True
+        ),
+        "joint 2: first sample is off by 0.25 rad": Fault(
+            inject.off(1, 0.25), steps=1, from_start=True
+        ),
+        "joint 2: first sample is off by 1 rad": Fault(
+            inject.off(1, 1.0), steps=1, from_start=True
+        ),
+        "all joints: frozen": Fault(inject.frozen("joint_angles"), ARM),
         "all joints: wrapped by a turn": Fault(
-            _put("joint_angles", lambda m: m.measured["joint_angles"] + 2.0 * math.pi),
+            inject.put("joint_angles", lambda m: m.measured["joint_angles"] + 2.0 * math.pi),
             JUMP,
         ),
         "all joints: NaN": Fault(
-            _put("joint_angles", lambda m: np.nan * m.measured["joint_angles"]),
+            inject.put("joint_angles", lambda m: np.nan * m.measured["joint_angles"]),
             ("measurement",),
         ),
         "all joints: complex": Fault(
-            _put("joint_angles", lambda m: m.measured["joint_angles"] + 1j),
+            inject.put("joint_angles", lambda m: m.measured["joint_angles"] + 1j),
             ("measurement",),
         ),
         "all joints: missing": Fault(lambda m: m.measured.pop("joint_angles"), ("measurement",)),
-        "torque of 3 N m": Fault(_weak(3.0), ARM, falls=True),
+        "torque of 3 N m": Fault(inject.weak(3.0), ARM, falls=True),
         "the arm ignores its commands": Fault(_nothing, ARM, sent=_at_rest),
-        "commands 0.5 s late": Fault(_late_commands, (*ARM, "ball_lost", "box"), 0.5),
-        "time stands": Fault(_frozen("time"), ("time",)),
-        "time 0.5 s back": Fault(_put("time", lambda m: m.measured["time"] - 0.5), ("time",)),
+        "commands 0.5 s late": Fault(inject.late_commands, (*ARM, "ball_lost", "box"), 0.5),
+        "time stands": Fault(inject.frozen("time"), ("time",)),
+        "time 0.5 s back": Fault(inject.put("time", lambda m: m.measured["time"] - 0.5), ("time",)),
         "time 0.5 s back in one sample": Fault(
-            _put("time", lambda m: m.measured["time"] - 0.5), steps=1
+            inject.put("time", lambda m: m.measured["time"] - 0.5), steps=1
         ),
-        "time 0.5 s ahead": Fault(_put("time", lambda m: m.measured["time"] + 0.5), ("late_step",)),
-        "time 50 s ahead": Fault(_put("time", lambda m: m.measured["time"] + 50.0), ("late_step",)),
+        "time 0.5 s ahead": Fault(
+            inject.put("time", lambda m: m.measured["time"] + 0.5), ("late_step",)
+        ),
+        "time 50 s ahead": Fault(
+            inject.put("time", lambda m: m.measured["time"] + 50.0), ("late_step",)
+        ),
         "time in ms from the start": Fault(
-            _put("time", lambda m: 1e3 * m.measured["time"]),
+            inject.put("time", lambda m: 1e3 * m.measured["time"]),
             ("measurement", "late_step"),
             from_start=True,
         ),
         "time in float32 from the start": Fault(
-            _put("time", lambda m: np.float32(1.7e9 + m.measured["time"])),
+            inject.put("time", lambda m: np.float32(1.7e9 + m.measured["time"])),
             ("measurement",),
             from_start=True,
         ),
         "time jitters by 4 ms": Fault(
-            _put("time", lambda m: m.measured["time"] + m.robot.random.uniform(-0.004, 0.004)),
+            inject.put("time", lambda m: m.measured["time"] + m.arm.random.uniform(-0.004, 0.004)),
             from_start=True,
         ),
         "the program pauses for 20 ms": Fault(_nothing, steps=2, pauses=True),
         "the program pauses for 0.2 s": Fault(_nothing, ("late_step",), steps=20, pauses=True),
-        "ball: the camera stops": Fault(_no_pictures, ("old_picture",)),
-        "ball: in mm": Fault(_ball(lambda m, x: 1e3 * x), ("ball_place", "ball_speed")),
-        "ball: one false picture": Fault(_ball(lambda m, x: x + [0.0, 0.6, 0.0]), steps=1),
-        "ball: 0.9 m aside": Fault(_ball(lambda m, x: x + [0.0, 0.9, 0.0]), FLIGHT),
-        "ball: mirrored": Fault(_ball(lambda m, x: x * [-1.0, -1.0, 1.0]), FLIGHT),
-        "ball: found 0.35 m aside": Fault(_ball(lambda m, x: x + [0.0, 0.35, 0.0]), FLIGHT),
+        "ball: the camera stops": Fault(inject.no_pictures, ("old_picture",)),
+        "ball: in mm": Fault(inject.ball(lambda m, x: 1e3 * x), ("ball_place", "ball_speed")),
+        "ball: one false picture": Fault(inject.ball(lambda m, x: x + [0.0, 0.6, 0.0]), steps=1),
+        "ball: 0.9 m aside": Fault(inject.ball(lambda m, x: x + [0.0, 0.9, 0.0]), FLIGHT),
+        "ball: mirrored": Fault(inject.ball(lambda m, x: x * [-1.0, -1.0, 1.0]), FLIGHT),
+        "ball: found 0.35 m aside": Fault(inject.ball(lambda m, x: x + [0.0, 0.35, 0.0]), FLIGHT),
         # Within the noise of the training's worlds: it may be seen when the ball misses the paddle.
         "ball: a camera is bumped by 5 cm": Fault(
-            _ball(lambda m, x: x + [0.0, 0.05, 0.0]), ("", *FLIGHT, "box"), math.inf
+            inject.ball(lambda m, x: x + [0.0, 0.05, 0.0]), ("", *FLIGHT, "box"), math.inf
         ),
         "ball: a second one 0.1 m aside in every second picture": Fault(_second_ball, FLIGHT),
-        "ball: held 0.4 m beside": Fault(_held([0.0, 0.4, 0.1]), FLIGHT),
-        "ball: held 0.3 m above": Fault(_held([0.0, 0.0, 0.3]), FLIGHT),
-        "ball: carried at 0.3 m/s": Fault(_held([0.0, 0.4, 0.1], speed=0.3), FLIGHT),
-        "ball: held 3 cm above": Fault(_held([0.0, 0.0, 0.05]), HELD, 0.5),
-        "ball: hidden": Fault(_ball(lambda m, x: np.ma.array(x, mask=True)), ("measurement",)),
+        "ball: held 0.4 m beside": Fault(inject.held([0.0, 0.4, 0.1]), FLIGHT),
+        "ball: held 0.3 m above": Fault(inject.held([0.0, 0.0, 0.3]), FLIGHT),
+        "ball: carried at 0.3 m/s": Fault(inject.held([0.0, 0.4, 0.1], speed=0.3), FLIGHT),
+        "ball: held 3 cm above": Fault(inject.held([0.0, 0.0, 0.05]), HELD, 0.5),
+        "ball: hidden": Fault(
+            inject.ball(lambda m, x: np.ma.array(x, mask=True)), ("measurement",)
+        ),
         "ball: thrown away": Fault(
-            _thrown(3.0), (*FLIGHT, "box", "ball_place", "old_picture"), 1.5, steps=1
+            inject.thrown(3.0), (*FLIGHT, "box", "ball_place", "old_picture"), 1.5, steps=1
         ),
         "joint velocities 9 rad/s off, in deg/s": Fault(
-            _put("joint_velocities", lambda m: np.degrees(9.0 + m.measured["joint_velocities"])),
+            inject.put(
+                "joint_velocities", lambda m: np.degrees(9.0 + m.measured["joint_velocities"])
+            ),
             ("joint_speed",),
         ),
     }
     if load_policy(policy).metadata.ball_rests is not False:
         # A hand near the paddle, and one that takes the ball off it, are no faults there.
-        found["ball: held 3 cm above"] = Fault(_held([0.0, 0.0, 0.05]), ("", *HELD), math.inf)
+        found["ball: held 3 cm above"] = Fault(inject.held([0.0, 0.0, 0.05]), ("", *HELD), math.inf)
     return found
 
 

@@ -448,8 +448,8 @@ class Env:
         qvel = scatter(np.zeros(self.mj_model.nv), self.addresses.arm_qvel, joint_velocities)
 
         if thrown is None:
-            heights = np.array([[0.0, 0.0, robot_model.BALLS_APART * i] for i in range(num_balls)])
-            thrown = (np.array(self.config.ball_init_pos) + heights, np.zeros((num_balls, 3)))
+            above = robot_model.balls_above(self.config.ball_init_pos, num_balls)
+            thrown = (above, np.zeros((num_balls, 3)))
         thrown_positions, thrown_velocities = thrown
         positions = jnp.asarray(thrown_positions, dtype).reshape(num_balls, 3)
         velocities = jnp.asarray(thrown_velocities, dtype).reshape(num_balls, 3)

@@ -13,7 +13,7 @@ import numpy as np
 from bounce_mjx.physics import CEngine, edited_model
 from bounce_mjx.rehearsal.camera import Camera
 from bounce_mjx.rehearsal.faults import Injection, Moment
-from bounce_mjx.robot.model import BALLS_APART, find_addresses, joint_names, joint_ranges
+from bounce_mjx.robot.model import balls_above, find_addresses, joint_names, joint_ranges
 from bounce_mjx.world.actuation import DEFAULT_PUSH_INTERVAL
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.model import world_model
@@ -192,6 +192,16 @@ class SimulatedArm:
         """The paddle's centre [3], m."""
         return self.data.geom_xpos[self.paddle_geom].copy()
 
+    @property
+    def picture_time(self) -> float:
+        """Time at which the newest picture that has arrived was taken, s."""
+        return self.camera.newest.taken
+
+    @property
+    def picture_noise(self) -> float:
+        """Standard deviation of a ball's position in a picture, m."""
+        return float(self.world.get("ball_position_noise", 0.0))
+
     def targets(self) -> np.ndarray:
         """As `Arm.targets`."""
         return self.command.copy()
@@ -283,8 +293,7 @@ class SimulatedArm:
             goals[name] = jnp.asarray(0.5 * (goal.low + goal.high))
         thrown = self._task.throw(draws, goals)
         if thrown is None:
-            apart = BALLS_APART * np.arange(len(self.balls))[:, None] * [0.0, 0.0, 1.0]
-            thrown = np.array(config.ball_init_pos) + apart, np.zeros(shape)
+            thrown = balls_above(config.ball_init_pos, len(self.balls)), np.zeros(shape)
         places, velocities = (np.asarray(x, float).reshape(shape) for x in thrown)
         self._places = places + noise + self.world.get("ball_start", 0.0)
         self._velocities = velocities

@@ -21,6 +21,7 @@ class Moment(NamedTuple):
     """A control step in which a fault is there."""
 
     arm: "SimulatedArm"
+    """Or another one with the attributes that a fault uses."""
     measured: dict[str, Any]
     """May be changed."""
     first: dict[str, Any]
@@ -197,12 +198,11 @@ def held(offset: list[float], speed: float = 0.0) -> Act:
         if moment.time == 0.0:
             places.clear()
             places[-1.0] = arm.paddle
-        taken = arm.camera.newest.taken
+        taken = arm.picture_time
         if taken not in places:
             place = places[-1.0] + offset + [0.0, speed * moment.time, 0.0]
             shape = moment.measured["ball_position"].shape
-            noise = arm.world.get("ball_position_noise", 0.0) * arm.random.standard_normal(shape)
-            places[taken] = place + noise
+            places[taken] = place + arm.picture_noise * arm.random.standard_normal(shape)
         moment.measured["ball_position"] = places[taken]
         moment.measured["ball_velocity"] = 0.0 * moment.measured["ball_velocity"]
 

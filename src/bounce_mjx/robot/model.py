@@ -38,6 +38,12 @@ BALLS_APART = 0.1
 """Height of each added ball above the last one, m."""
 
 
+def balls_above(place: Sequence[float], num_balls: int) -> np.ndarray:
+    """Places of balls one above another [B, 3], m, the first one at a place [3]."""
+    heights = BALLS_APART * np.arange(num_balls)
+    return np.array(place) + heights[:, None] * [0.0, 0.0, 1.0]
+
+
 class BallAddresses(NamedTuple):
     """Indices of one ball in the arrays of the model."""
 
