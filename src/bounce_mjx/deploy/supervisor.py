@@ -284,7 +284,9 @@ class Supervisor:
         of_arm = {name: value for name, value in measurements.items() if name in _OF_ARM}
         measured = self._driver.check(of_arm, ("joint_angles",))
         progress = self._timed(progress, measured, host)
-        progress = progress._replace(balls=self._balls(measurements))
+        balls = self._given(measurements, "ball_position")
+        places = None if balls is None else balls.reshape(-1, 3)
+        progress = progress._replace(balls=places)
         if not progress.has_found_arm:
             return self._find_arm(progress, measured, waited)
         return self._go_home(progress, measured, waited)
@@ -327,7 +329,6 @@ class Supervisor:
         self._controller.samples.check_range("angle", angles)
         target = follow_target(progress.target, measured)
         course = memory.course
-        now = seen.clock.now
         progress = progress._replace(memory=memory._replace(seen=seen), target=target)
         is_place_known = course is not None
         try:
@@ -353,10 +354,7 @@ class Supervisor:
         except Unknown as unknown:
             if not is_place_known:
                 return progress._replace(waits_for=str(unknown), waits_since=None), steps
-            since = now if progress.waits_since is None else progress.waits_since
-            if now - since > _SETTLING:
-                raise Fault("joint_astray", str(unknown)) from None
-            return progress._replace(waits_for=str(unknown), waits_since=since), steps
+            return self._wait(progress, unknown), steps
         seen = self._controller.samples.rest(seen, angles)
         command = self._controller.motion.target(course)
         progress = progress._replace(
@@ -415,17 +413,25 @@ class Supervisor:
         Raises:
           Fault: it had time to settle.
         """
-        now = progress.memory.seen.clock.now
         place = self._controller.motion.target(progress.memory.course)
         room = self._watch.offset
         try:
             check_place(self._metadata, angles, place, room, "where its commands rest")
         except Unknown as unknown:
-            since = now if progress.waits_since is None else progress.waits_since
-            if now - since > _SETTLING:
-                raise Fault("joint_astray", str(unknown)) from None
-            return progress._replace(phase="homing", waits_for=str(unknown), waits_since=since)
+            return self._wait(progress._replace(phase="homing"), unknown)
         return progress._replace(phase="ready", waits_for=None, waits_since=None)
+
+    def _wait(self, progress: Progress, unknown: Unknown) -> Progress:
+        """An arm that is not where its commands rest, and may still come there.
+
+        Raises:
+          Fault: it had time to settle.
+        """
+        now = progress.memory.seen.clock.now
+        since = now if progress.waits_since is None else progress.waits_since
+        if now - since > _SETTLING:
+            raise Fault("joint_astray", str(unknown)) from None
+        return progress._replace(waits_for=str(unknown), waits_since=since)
 
     def _follow(
         self, progress: Progress, measured: Measurements, waited: float | None
@@ -506,21 +512,21 @@ class Supervisor:
             witness = witness.at_host(host)
             clock, _, steps = advance(clock, witness.time, self._dt, waited)
         else:
-            given = self._given_time(measurements)
-            new, elapsed, steps = advance(clock, given, self._dt)
-            if given is None or elapsed <= 0.0:
-                clock = begin_anew(clock, given, self._dt)
+            given = self._given(measurements, "time")
+            time_given = None if given is None else float(given[0])
+            new, elapsed, steps = advance(clock, time_given, self._dt)
+            if time_given is None or elapsed <= 0.0:
+                clock = begin_anew(clock, time_given, self._dt)
                 steps = 1
             else:
                 clock = new
         memory = memory._replace(seen=memory.seen._replace(clock=clock))
         return progress._replace(memory=memory, witness=witness), steps
 
-    def _given_time(self, measurements: Mapping[str, Any]) -> float | None:
-        """The driver's time, s; None if it cannot be read."""
+    def _given(self, measurements: Mapping[str, Any], name: str) -> np.ndarray | None:
+        """A measurement by its name; None if it is missing or cannot be read."""
         try:
-            given = {"time": measurements["time"]}
-            return float(self._driver.check(given, ())["time"][0])
+            return self._driver.check({name: measurements[name]}, (name,))[name]
         except (UserError, KeyError, TypeError):
             return None
 
@@ -530,23 +536,11 @@ class Supervisor:
         since = progress.waits_since
         if since is not None and progress.memory.seen.clock.now - since <= _SETTLING:
             return True
-        try:
-            given = {"joint_angles": measurements["joint_angles"]}
-            angles = self._driver.check(given, ("joint_angles",))["joint_angles"]
-        except (UserError, KeyError, TypeError):
+        angles = self._given(measurements, "joint_angles")
+        if angles is None:
             return True
         place = self._controller.motion.target(progress.memory.course)
         return bool(np.all(np.abs(angles - place) <= self._watch.offset))
-
-    def _balls(self, measurements: Mapping[str, Any]) -> np.ndarray | None:
-        """The balls [B, 3] that are measured before a start, if they are."""
-        if "ball_position" not in measurements:
-            return None
-        try:
-            given = {"ball_position": measurements["ball_position"]}
-            return self._driver.check(given, ())["ball_position"].reshape(-1, 3)
-        except UserError:
-            return None
 
     def _check_start(self, progress: Progress) -> None:
         """Raises UserError for a ball that is not over the paddle by forward kinematics."""
