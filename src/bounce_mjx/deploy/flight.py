@@ -1,5 +1,6 @@
 """Whether a ball falls: away from the paddle, its last pictures lie on a parabola of gravity's
-curvature; near it, the ball leaves again unless the task lets it rest.
+curvature; near it, the ball leaves again unless the task lets it rest, and runs on: a picture lies
+between its neighbours.
 
 In free flight a ball's places are x0 + v t + g t^2 / 2. What is left of them after the least
 squares in x0 and v is judged in three directions: the largest of single pictures; the part along
@@ -39,6 +40,12 @@ _TOUCH = 0.07
 _REACH = 0.15
 # Time in which a ball near the paddle leaves it, s.
 _LEAVING = 0.4
+# Pictures of a ball near the paddle of which most lie between their neighbours (an impact is one
+# that need not), as far as the noise allows in standard deviations; and how many times that of a
+# picture the deviation of such a difference is, at most.
+_NEIGHBOURS = 6
+_BETWEEN = 3.0
+_OF_THREE = 1.4
 
 
 class Flight(NamedTuple):
@@ -55,6 +62,8 @@ class Flight(NamedTuple):
     near_since: float | None
     """Time from which the ball was near the paddle and was not seen to fall, s; None of one that
     was."""
+    near: tuple[tuple[float, np.ndarray], ...] = ()
+    """The last pictures since then: when they were taken, s, and the place [3], m."""
 
 
 class FlightBounds(NamedTuple):
@@ -81,6 +90,12 @@ def flight_bounds(metadata: Metadata) -> FlightBounds:
         may_rest=metadata.ball_rests is not False,
         dt=metadata.control_dt,
     )
+
+
+def may_lie(bounds: FlightBounds, place: np.ndarray, paddle: np.ndarray) -> bool:
+    """Whether a ball may rest at its place [3], m: on the paddle, whose centre is at [3], m."""
+    x, y, height = place - paddle
+    return bounds.may_rest and math.hypot(x, y) < _REACH and abs(height) < _TOUCH
 
 
 class Fit(NamedTuple):
@@ -195,8 +210,9 @@ def follow(
         seconds = times[-1] - times[0]
         return flight, f"has not fallen as a ball does for {1e3 * seconds:.0f} ms"
     # A ball at which the paddle swings comes and goes, and has left when it is seen to fall.
-    near_since = None if fit.is_known else flight.near_since
-    return Flight(times, places, height, is_over, near_since), None
+    if fit.is_known:
+        return Flight(times, places, height, is_over, None), None
+    return Flight(times, places, height, is_over, flight.near_since, flight.near), None
 
 
 def _touching(
@@ -207,4 +223,28 @@ def _touching(
     if not bounds.may_rest and time - near_since > _LEAVING:
         seconds = time - near_since
         return flight, f"has been near the paddle for {seconds:.2g} s, where it bounces off"
-    return Flight(np.array([time]), place[None], height, True, near_since), None
+    near = (*flight.near, (time, place))[-_NEIGHBOURS:]
+    if _zigzags(bounds.noise, near):
+        return flight, "goes to and fro, as two things would that look like it"
+    return Flight(np.array([time]), place[None], height, True, near_since, near), None
+
+
+def _zigzags(noise: float, near: tuple[tuple[float, np.ndarray], ...]) -> bool:
+    """Whether most pictures lie beside the way of a ball between their neighbours, seen from above:
+    they are of two things.
+
+    Args:
+      noise: standard deviation of a place along an axis, m.
+      near: the times, s, and places [3], m, of the last pictures.
+    """
+    if len(near) < _NEIGHBOURS:
+        return False
+    times = np.array([time for time, _ in near])
+    places = np.array([place[:2] for _, place in near])
+    duration = times[2:] - times[:-2]
+    share = ((times[1:-1] - times[:-2]) / duration)[:, None]
+    chord = places[2:] - places[:-2]
+    beside = places[1:-1] - places[:-2] - share * chord
+    speed = np.hypot(chord[:, 0], chord[:, 1]) / duration
+    allowed = _BETWEEN * _OF_THREE * np.hypot(noise, _TIMING * speed)
+    return bool(np.sum(np.hypot(beside[:, 0], beside[:, 1]) > allowed) > 0.5 * len(beside))

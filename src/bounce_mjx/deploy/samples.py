@@ -16,8 +16,8 @@ from typing import NamedTuple
 import numpy as np
 
 from bounce_mjx.deploy.clock import MOST_STANDING, Clock, advance, is_pause
-from bounce_mjx.deploy.flight import Flight, begin, flight_bounds, follow
-from bounce_mjx.deploy.metadata import Metadata, joint_ends, largest_term
+from bounce_mjx.deploy.flight import Flight, begin, flight_bounds, follow, may_lie
+from bounce_mjx.deploy.metadata import Metadata, joint_ends, largest_term, least_term
 from bounce_mjx.deploy.motion import paddle_position
 from bounce_mjx.errors import UserError
 
@@ -37,6 +37,10 @@ _BRIDGED_PICTURES = 4.0
 # Pictures of the same position are two if they are farther apart than this share of a control step:
 # the newest ones of two steps are half of it apart or more, whatever the camera's rate.
 _APART = 0.4
+# The same of pictures without an age, of a ball that may lie still, in the training's longest
+# intervals between two, and at least, s: sooner, there may have been none.
+_STILL_FOR = 3.0
+_LEAST_STILL = 0.05
 # Time in which velocities and angles are compared, s; the least way that counts, rad, how much
 # later the velocities may be, s, and their errors as a share of the way.
 _COMPARED = 0.1
@@ -153,6 +157,8 @@ class Samples:
         self._start_room = _NEAR + metadata.start_noise
         self._still = np.zeros(len(self._start))
         self._flight = flight_bounds(metadata)
+        slowest = least_term(metadata, "camera_rate", 1.0 / metadata.control_dt)
+        self._still_for = max(_STILL_FOR / slowest, _LEAST_STILL)
 
     def take(
         self,
@@ -395,8 +401,8 @@ class Samples:
         last = seen.picture
         taken = seen.clock.now - (age or 0.0)
         is_new = last is None or bool((balls != last.balls).any())
-        if not is_new and age is not None:
-            is_new = taken > last.taken + _APART * self._dt
+        if not is_new:
+            is_new = self._is_later(seen, taken - last.taken, has_age=age is not None)
         doubt = self._doubt_of_velocity(measured)
         flights = seen.flights
         if doubt is None and is_new:
@@ -407,6 +413,21 @@ class Samples:
             interval = self._dt if last is None else taken - last.taken
             seen = seen._replace(picture=Picture(balls, taken, interval), flights=flights)
         return self._believe(seen, measured, _OF_BALL)
+
+    def _is_later(self, seen: Seen, later: float, has_age: bool) -> bool:
+        """Whether a place that repeats is that of another picture.
+
+        Args:
+          later: by how much it was taken later, or came later, s.
+          has_age: whether it is known when it was taken; if not, only balls that may lie where they
+            are repeat their place.
+        """
+        if has_age:
+            return later > _APART * self._dt
+        if later < self._still_for or not seen.paddle:
+            return False
+        paddle = seen.paddle[-1][1]
+        return all(may_lie(self._flight, ball, paddle) for ball in seen.picture.balls)
 
     def _doubt_of_velocity(self, measured: Measurements) -> Doubt | None:
         if "ball_velocity" not in measured:
