@@ -1,6 +1,7 @@
 """Whether a ball falls: away from the paddle, its last pictures lie on a parabola of gravity's
-curvature; near it, the ball leaves again unless the task lets it rest, and runs on: a picture lies
-between its neighbours.
+curvature; near it, where it bounces, they do not lie on a straight line, as those of a ball that a
+hand holds or carries do, unless the task lets the ball rest; and seen from above it runs on, so
+that a picture lies between its neighbours.
 
 In free flight a ball's places are x0 + v t + g t^2 / 2. What is left of them after the least
 squares in x0 and v is judged in three directions: the largest of single pictures; the part along
@@ -38,14 +39,29 @@ _IMPACT_SPEED = 5.0
 _TOUCH = 0.07
 # Horizontal distance from the paddle's centre at which it may touch, m.
 _REACH = 0.15
-# Time in which a ball near the paddle leaves it, s.
-_LEAVING = 0.4
+# Time in which a ball near the paddle leaves the straight line on which a hand would carry it, and
+# the time in which it is seen to fall, s.
+_HELD = 0.4
+_LEAVING = 1.0
+# How far the root mean square of noise may be above its standard deviation, in deviations of it.
+_ABOVE = 3.5
 # Pictures of a ball near the paddle of which most lie between their neighbours (an impact is one
 # that need not), as far as the noise allows in standard deviations; and how many times that of a
 # picture the deviation of such a difference is, at most.
 _NEIGHBOURS = 6
 _BETWEEN = 3.0
 _OF_THREE = 1.4
+
+
+class Near(NamedTuple):
+    """A ball near the paddle that was not seen to fall since."""
+
+    since: float
+    """The time of its first picture, s."""
+    times: np.ndarray
+    """Of the pictures in the last 0.4 s [N], s."""
+    places: np.ndarray
+    """Of the ball in them [N, 3], m."""
 
 
 class Flight(NamedTuple):
@@ -59,11 +75,8 @@ class Flight(NamedTuple):
     """Of the last one above the paddle, m."""
     is_over: bool
     """Whether the last one was over the paddle."""
-    near_since: float | None
-    """Time from which the ball was near the paddle and was not seen to fall, s; None of one that
-    was."""
-    near: tuple[tuple[float, np.ndarray], ...] = ()
-    """The last pictures since then: when they were taken, s, and the place [3], m."""
+    near: Near | None
+    """None of a ball that was seen to fall since it was near the paddle."""
 
 
 class FlightBounds(NamedTuple):
@@ -210,37 +223,60 @@ def follow(
         seconds = times[-1] - times[0]
         return flight, f"has not fallen as a ball does for {1e3 * seconds:.0f} ms"
     # A ball at which the paddle swings comes and goes, and has left when it is seen to fall.
-    if fit.is_known:
-        return Flight(times, places, height, is_over, None), None
-    return Flight(times, places, height, is_over, flight.near_since, flight.near), None
+    near = None if fit.is_known or flight.near is None else _still_near(flight.near, time, place)
+    return Flight(times, places, height, is_over, near), None
 
 
 def _touching(
     bounds: FlightBounds, flight: Flight, time: float, place: np.ndarray, height: float
 ) -> tuple[Flight, str | None]:
     """A picture before which the ball may have touched the paddle: a new flight begins."""
-    near_since = float(flight.times[-1]) if flight.near_since is None else flight.near_since
-    if not bounds.may_rest and time - near_since > _LEAVING:
-        seconds = time - near_since
-        return flight, f"has been near the paddle for {seconds:.2g} s, where it bounces off"
-    near = (*flight.near, (time, place))[-_NEIGHBOURS:]
-    if _zigzags(bounds.noise, near):
+    near = flight.near
+    if near is None:
+        near = Near(float(flight.times[-1]), flight.times[-1:], flight.places[-1:])
+    near = _still_near(near, time, place)
+    if _goes_to_and_fro(near, bounds.noise):
         return flight, "goes to and fro, as two things would that look like it"
-    return Flight(np.array([time]), place[None], height, True, near_since, near), None
+    if not bounds.may_rest:
+        seconds = time - near.since
+        if seconds > _HELD and _is_straight(near, bounds.noise):
+            reason = f"has been near the paddle for {seconds:.2g} s as if it were held there"
+            return flight, reason
+        if seconds > _LEAVING:
+            reason = f"has been near the paddle for {seconds:.2g} s, where it bounces off"
+            return flight, reason
+    return Flight(np.array([time]), place[None], height, True, near), None
 
 
-def _zigzags(noise: float, near: tuple[tuple[float, np.ndarray], ...]) -> bool:
-    """Whether most pictures lie beside the way of a ball between their neighbours, seen from above:
-    they are of two things.
+def _still_near(near: Near, time: float, place: np.ndarray) -> Near:
+    """With one more picture."""
+    kept = near.times > time - _HELD
+    times = np.append(near.times[kept], time)
+    places = np.vstack([near.places[kept], place])
+    return Near(near.since, times, places)
 
-    Args:
-      noise: standard deviation of a place along an axis, m.
-      near: the times, s, and places [3], m, of the last pictures.
-    """
-    if len(near) < _NEIGHBOURS:
+
+def _is_straight(near: Near, noise: float) -> bool:
+    """Whether the heights are those of a constant velocity, but for a noise (m)."""
+    count = len(near.times)
+    if count < 3:
+        return True
+    t = near.times - near.times.mean()
+    heights = near.places[:, 2]
+    left = heights - heights.mean()
+    left -= t * ((t @ left) / (t @ t))
+    # The root mean square of n values of deviation 1 has a deviation of 1 / sqrt(2 n).
+    bound = 1.0 + _ABOVE / math.sqrt(2.0 * (count - 2))
+    return math.sqrt((left @ left) / (count - 2)) < bound * noise
+
+
+def _goes_to_and_fro(near: Near, noise: float) -> bool:
+    """Whether most of the last pictures lie beside the way of a ball between their neighbours, seen
+    from above, but for a noise (m): they are of two things."""
+    if len(near.times) < _NEIGHBOURS:
         return False
-    times = np.array([time for time, _ in near])
-    places = np.array([place[:2] for _, place in near])
+    times = near.times[-_NEIGHBOURS:]
+    places = near.places[-_NEIGHBOURS:, :2]
     duration = times[2:] - times[:-2]
     share = ((times[1:-1] - times[:-2]) / duration)[:, None]
     chord = places[2:] - places[:-2]
