@@ -132,25 +132,25 @@ def fit_fall(times: np.ndarray, places: np.ndarray, noise: float, push: float = 
     count = len(times)
     if count < 3:
         return Fit(0.0, False)
-    t = times - times.mean()
-    spread = t @ t
-    fallen = -0.5 * GRAVITY * t * t
-    left = places - places.mean(axis=0)
-    left[:, 2] -= fallen - fallen.mean()
+    t = times - times.sum() / count
+    spread = float(t @ t)
+    bend = t * t - spread / count
+    # The fall is the bend, less its mean.
+    left = places - places.sum(axis=0) / count
+    left[:, 2] += 0.5 * GRAVITY * bend
     velocity = (t @ left) / spread
     left -= t[:, None] * velocity
-    bend = t * t - spread / count
     bend -= t * ((t @ bend) / spread)
     bend_size = math.sqrt(bend @ bend)
-    along = bend @ left / bend_size
-    squared_speed = velocity @ velocity + GRAVITY**2 * spread / count
+    along = (bend @ left / bend_size).tolist()
+    squared_speed = float(velocity @ velocity) + GRAVITY**2 * spread / count
     bound = _DEVIATIONS * math.sqrt(noise**2 + _TIMING**2 * squared_speed)
     drag = 0.5 * _DRAG * squared_speed
-    alone_bound = bound + drag * np.abs(bend).max()
+    alone_bound = bound + drag * float(np.abs(bend).max())
     along_bound = bound + drag * bend_size
-    steps = _along_steps(t, spread, left)
-    sizes = np.abs(left).max(axis=0)
-    pushed = push * (times[-1] - times[0])
+    steps = _along_steps(t, spread, left).tolist()
+    sizes = np.abs(left).max(axis=0).tolist()
+    pushed = push * float(times[-1] - times[0])
     alone_pushed = alone_bound + _KINK_ALONE * pushed
     along_pushed = along_bound + _KINK * math.sqrt(count) * pushed
     ratio = max(
@@ -162,7 +162,7 @@ def fit_fall(times: np.ndarray, places: np.ndarray, noise: float, push: float = 
         math.hypot(steps[0], steps[1]) / along_pushed,
     )
     at_rest = 0.5 * GRAVITY * bend_size
-    return Fit(float(ratio), at_rest > _DEVIATIONS * noise)
+    return Fit(ratio, at_rest > _DEVIATIONS * noise)
 
 
 def _along_steps(t: np.ndarray, spread: float, left: np.ndarray) -> np.ndarray:
@@ -204,20 +204,19 @@ def follow(
       paddle: the paddle's centre then [3], m.
     """
     since = time - flight.times[-1]
-    offset = place - paddle
-    height = float(offset[2])
+    x, y, height = (place - paddle).tolist()
     moved = math.dist(place, flight.places[-1])
     reach = bounds.speed * max(since, bounds.dt) + _DEVIATIONS * math.sqrt(2.0) * bounds.noise
     if moved > reach:
         reason = f"is {moved:.3g} m from {1e3 * since:.0f} ms before, farther than it flies"
         return flight, reason
-    is_over = math.hypot(offset[0], offset[1]) < _REACH
+    is_over = math.hypot(x, y) < _REACH
     low = height + flight.height - 2.0 * _TOUCH < _IMPACT_SPEED * since
     if low and is_over and (flight.is_over or len(flight.times) == 1):
         return _touching(bounds, flight, time, place, height)
-    kept = flight.times > time - _WINDOW
-    times = np.append(flight.times[kept], time)
-    places = np.vstack([flight.places[kept], place])
+    first = int(np.searchsorted(flight.times, time - _WINDOW, side="right"))
+    times = np.concatenate([flight.times[first:], [time]])
+    places = np.concatenate([flight.places[first:], place[None]])
     fit = fit_fall(times, places, bounds.noise, bounds.push)
     if fit.ratio > 1.0:
         seconds = times[-1] - times[0]

@@ -1,5 +1,6 @@
 """The commands that a robot gets between two actions, and where they bring the paddle."""
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -117,28 +118,25 @@ class Motion:
 def paddle_position(metadata: Metadata, joint_angles: np.ndarray) -> np.ndarray:
     """World position [..., 3] (m) of the paddle's centre at joint angles [..., J] (rad), by
     Rodrigues' formula for the hinges' rotations."""
-    joints = [link.joint for link in metadata.chain]
-    turned = joint_angles[..., joints] - [link.reference for link in metadata.chain]
-    # One number for each hinge, or one array of a batch.
-    cosines = np.moveaxis(np.cos(turned), -1, 0)
-    sines = np.moveaxis(np.sin(turned), -1, 0)
-    if turned.ndim == 1:
-        # Python's numbers are the fastest.
-        cosines = cosines.tolist()
-        sines = sines.tolist()
+    # One number for each joint, which Python computes the fastest, or one array of a batch.
+    is_batch = joint_angles.ndim > 1
+    angles = np.moveaxis(joint_angles, -1, 0) if is_batch else joint_angles.tolist()
+    cos = np.cos if is_batch else math.cos
+    sin = np.sin if is_batch else math.sin
     x, y, z = metadata.paddle
-    for i in reversed(range(len(joints))):
-        a, b, c = metadata.chain[i].axis
-        left, ahead, up = metadata.chain[i].position
-        cosine = cosines[i]
-        sine = sines[i]
+    for link in reversed(metadata.chain):
+        a, b, c = link.axis
+        left, ahead, up = link.position
+        turned = angles[link.joint] - link.reference
+        cosine = cos(turned)
+        sine = sin(turned)
         along = (1.0 - cosine) * (a * x + b * y + c * z)
         x, y, z = (
             left + cosine * x + sine * (b * z - c * y) + along * a,
             ahead + cosine * y + sine * (c * x - a * z) + along * b,
             up + cosine * z + sine * (a * y - b * x) + along * c,
         )
-    return np.stack([x, y, z], axis=-1)
+    return np.stack([x, y, z], axis=-1) if is_batch else np.array([x, y, z])
 
 
 def paddle_normal(metadata: Metadata, joint_angles: np.ndarray) -> np.ndarray:

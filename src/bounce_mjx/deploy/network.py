@@ -123,20 +123,18 @@ class OnnxNetwork:
         if self.metadata.velocity == "differences" and view is not None:
             measured = measured | {"ball_velocity": view.velocity}
         newest = self._newest(measured, action)
-        rows = {name: _zeros(entry) for name, entry in self._inputs.items()}
+        rows = {name: history.remembered[name] for name in self._read_again}
         quantities = {}
         for name, values in history.quantities.items():
             if history.is_first:
                 quantities[name] = np.broadcast_to(newest[name], values.shape)
             else:
                 quantities[name] = np.concatenate([newest[name][None], values[:-1]])
-            rows[name][0] = quantities[name]
+            rows[name] = quantities[name][None].astype(np.float32)
         for name in self._measured:
-            rows[NEWEST + name][0] = newest[name]
-        if IS_FIRST in rows:
-            rows[IS_FIRST][0] = history.is_first
-        for name in self._read_again:
-            rows[name] = history.remembered[name]
+            rows[NEWEST + name] = newest[name][None].astype(np.float32)
+        if IS_FIRST in self._inputs:
+            rows[IS_FIRST] = np.array([history.is_first])
         result, *values = self._session.run(self._outputs, rows)
         if not np.isfinite(result).all():
             raise NoAction("the network returned an action that is not finite; stop the robot")

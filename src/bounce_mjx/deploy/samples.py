@@ -285,7 +285,8 @@ class Samples:
         elapsed = max(seen.clock.now - seen.arm_time, self._dt)
         change = np.abs(angles - last)
         too_far = change - (self._fastest * elapsed + self._noise)
-        if too_far.max() > 0.0:
+        # Of so few numbers, Python's maximum is the faster.
+        if max(too_far.tolist()) > 0.0:
             joint = int(np.argmax(too_far))
             turned = abs(change[joint] - 2.0 * math.pi) < 0.2
             remedy = "give unwrapped angles" if turned else "check the encoder, or call reset"
@@ -302,7 +303,7 @@ class Samples:
         velocities = measured["joint_velocities"]
         speeds = np.abs(velocities)
         too_fast = speeds - self._fastest
-        if too_fast.max() > 0.0:
+        if max(too_fast.tolist()) > 0.0:
             joint = int(np.argmax(too_fast))
             reason = (
                 f"{self._metadata.joint_names[joint]} has {velocities[joint]:.3g} rad/s, and moves "
@@ -344,7 +345,7 @@ class Samples:
         allowed = _LEAST_WAY + self._noise + noise + self._velocity_bias * duration
         allowed = allowed + fastest * (_VELOCITY_LAG + self._dt) + _OF_WAY * largest_way
         beyond = np.abs(by_angles - by_velocities) - allowed
-        if beyond.max() <= 0.0:
+        if max(beyond.tolist()) <= 0.0:
             return moved
         joint = int(np.argmax(beyond))
         reason = (
@@ -365,7 +366,7 @@ class Samples:
           ImpossibleMeasurement: one is 0.5 rad outside.
         """
         outside = np.maximum(self._low - angles, angles - self._high)
-        if outside.max() > _OUTSIDE:
+        if max(outside.tolist()) > _OUTSIDE:
             joint = int(np.argmax(outside))
             raise ImpossibleMeasurement(
                 "joint_range",
