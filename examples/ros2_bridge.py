@@ -35,7 +35,7 @@ from std_msgs.msg import Empty, Float64MultiArray, Header
 from bounce_mjx import load_policy
 from bounce_mjx.deploy.box import add_box, box_of
 from bounce_mjx.deploy.session import play
-from bounce_mjx.errors import UserError
+from bounce_mjx.errors import UserError, exit_on_user_error
 
 RATE = 500.0
 """Commands a second, Hz."""
@@ -234,4 +234,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with exit_on_user_error():
+        main()

@@ -21,6 +21,7 @@ import numpy as np
 from bounce_mjx import load_policy
 from bounce_mjx.deploy.box import add_box, box_of
 from bounce_mjx.deploy.session import Terminal, play
+from bounce_mjx.errors import exit_on_user_error
 
 RATE = 500.0
 """Commands a second, Hz."""
@@ -200,4 +201,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with exit_on_user_error():
+        main()
