@@ -14,13 +14,14 @@ import bounce_mjx
 from bounce_mjx.commands import eval as eval_command
 from bounce_mjx.commands.main import main as console_script
 from bounce_mjx.commands.play import PlayCommand
+from bounce_mjx.commands.train import fields_of_command
 from bounce_mjx.commands.which_policy import film_command
 from bounce_mjx.config.command_line import flags_of, parse
 from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.folders import choose_checkpoint
-from bounce_mjx.runs.layers import Choice, read_layers, read_preset
-from bounce_mjx.training.command import fields_of_command
+from bounce_mjx.runs.layers import read_preset
+from bounce_mjx.runs.start import Choice, find_start
 from bounce_mjx.viewers.simulation import Simulation
 from tiny_runs import STEPS, TINY, TRAIN_SCRIPT, shared_run
 
@@ -248,7 +249,7 @@ def test_the_help_of_a_training_is_one_screen_and_the_whole_help_has_every_flag(
     assert "--num-envs INT          Environments that run in parallel (default: 512)" in pages[0]
     shown = {*re.findall(r"^  (--[\w.-]+)", pages[1], re.MULTILINE)}
     shown |= {*re.findall(r"^  --.+, (--no-[\w.-]+)", pages[1], re.MULTILINE)}
-    known = {*flags_of(fields_of_command(read_layers(Choice())))}
+    known = {*flags_of(fields_of_command(find_start(Choice())))}
     assert shown == known
     assert pages[1].index("\nppo:\n") < pages[1].index("--learning-rate FLOAT")
 

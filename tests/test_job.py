@@ -38,7 +38,8 @@ from bounce_mjx.runs.folders import (
     run_or_newest,
     stored_checkpoints,
 )
-from bounce_mjx.runs.layers import Choice, read_layers
+from bounce_mjx.runs.layers import read_layers
+from bounce_mjx.runs.start import Choice
 from bounce_mjx.training import hosts, job, saving
 from bounce_mjx.training.events import Event
 from bounce_mjx.training.faults import first_block_fault

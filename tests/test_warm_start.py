@@ -26,7 +26,7 @@ from bounce_mjx.runs.checkpoints import (
 )
 from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.folders import best_checkpoint, create_run, find_checkpoint
-from tiny_runs import STEPS, TINY
+from tiny_runs import STEPS, TINY, settings_of
 
 CRITIC = {"n_bounces", "world/restitution", "world/air_drag"}
 WORLD = {
@@ -64,7 +64,7 @@ def test_the_value_network_keeps_the_terms_of_both_worlds_and_is_blind_to_new_on
     world = tmp_path / "world.yaml"
     world.write_text(yaml.safe_dump(WORLD))
     args = ["--warm-start", str(first), "--world", str(world), "--config", "cpu"]
-    command = train_command.read_command(args).config
+    command = settings_of(args).config
     assert command.ppo.critic_metrics == ("n_bounces", "world/*")
     env = Env(command.env)
     names = names_of_critic_metrics(command.ppo, env)
@@ -106,7 +106,7 @@ def test_a_training_starts_with_the_policy_of_the_run(first: Path, tmp_path: Pat
 
 def test_the_small_robust_policy_can_be_trained_further() -> None:
     args = "--warm-start robust_small --config finetune --world fast_servo".split()
-    command = train_command.read_command(args).config
+    command = settings_of(args).config
     assert str(command.warm_start) == "robust_small"
     assert command.env.randomization.terms and command.env.randomization.share == 1.0
     params, _ = read_start(command, Env(command.env))
@@ -127,7 +127,7 @@ def test_networks_of_an_own_algorithm_are_no_warm_start(tmp_path: Path) -> None:
     (tmp_path / "own.py").write_text(OWN_NETWORKS)
     import_code(tmp_path / "own.py")
     flags = [*TINY, "--log-dir", str(tmp_path / "runs"), "--algorithm", "own"]
-    config = train_command.read_command(flags).config
+    config = settings_of(flags).config
     with pytest.raises(UserError, match="Own makes networks of its own, which --warm-start cannot"):
         read_start(config.model_copy(update={"warm_start": Path("robust_small")}), Env(config.env))
     # A run whose networks are others.
@@ -149,10 +149,10 @@ def test_the_latest_run_is_that_beside_the_new_one_or_else_of_the_task(
     monkeypatch.chdir(tmp_path)
     run = tmp_path / "runs/bounce_ball/2026-01-01_00-00-00"
     shutil.copytree(find_checkpoint("robust_small").run, run)
-    config = train_command.read_command("--warm-start latest --log-dir new".split()).config
+    config = settings_of("--warm-start latest --log-dir new".split()).config
     assert config.warm_start == best_checkpoint(run).folder
     assert config.log_dir == Path("new")
     # But where the new one's folder has runs, it is one of those, as with --resume.
     other = shutil.copytree(run, tmp_path / "mine/2025-01-01_00-00-00")
-    config = train_command.read_command("--warm-start latest --log-dir mine".split()).config
+    config = settings_of("--warm-start latest --log-dir mine".split()).config
     assert config.warm_start == best_checkpoint(other).folder

@@ -7,7 +7,8 @@ from typing import Literal
 from bounce_mjx.config.command_line import flag_names, parse, read_flags, stdout
 from bounce_mjx.config.files import flat
 from bounce_mjx.config.settings import StrictModel, fields_in
-from bounce_mjx.runs.layers import Choice, read_layers
+from bounce_mjx.runs.layers import read_layers
+from bounce_mjx.runs.start import Choice
 from bounce_mjx.task.registry import DEFAULT
 from bounce_mjx.viewers.options import ViewerOptions
 

@@ -25,14 +25,13 @@ import itertools
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import pydantic
 from pydantic.fields import FieldInfo
 
-from bounce_mjx.config.command_line import Flag
 from bounce_mjx.config.files import differing_keys, flat
-from bounce_mjx.config.settings import Layer, StrictModel, default_of, has_default, merged, nested
+from bounce_mjx.config.settings import Layer, default_of, has_default, merged, nested
 from bounce_mjx.config.validation import describe, groups_of, path_of
 from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.learning.config import PPOConfig
@@ -40,10 +39,9 @@ from bounce_mjx.runs.config import (
     DEFAULT_SOURCE,
     RESUMABLE_KEYS,
     TrainConfig,
-    fields_of,
 )
 from bounce_mjx.runs.presets import BASE, SOURCES, preset_files, read_config_file, shown_file
-from bounce_mjx.runs.start import Start, beside_run, find_start
+from bounce_mjx.runs.start import Choice, Start, beside_run, find_start
 from bounce_mjx.runs.worlds import layers_of_environment
 from bounce_mjx.world.named import without_idle_curriculum
 
@@ -51,39 +49,6 @@ FLAGS = "flags"
 """Source of the settings on a command line."""
 PYTHON = "train"
 """Source of the arguments of `train`."""
-
-
-class ChoiceFlags(StrictModel):
-    """The flags that decide which layers there are. The last three are keys of the config, too: the
-    algorithm's class, the policy of a warm start, and where latest is looked for."""
-
-    config: Annotated[tuple[Path, ...], Flag(metavar="NAME|FILE", is_repeated=True)] = ()
-    """Preset, such as cpu or finetune (a YAML file in configs/), or a YAML file of yours. A task's
-    own preset of that name, such as configs/track/cpu.yaml, takes its place. The default is default
-    on an accelerator, and cpu on a CPU. A file of yours lies on that default, or on the preset that
-    its key base names. Given again, each file lies on those before it."""
-    robot: Annotated[Path | None, Flag(metavar="NAME|FILE")] = None
-    """Config of a robot on top of the preset: the file that bounce-mjx adopt wrote, or the name of
-    one in configs/robots/ (ur5e, panda or iiwa)."""
-    world: Annotated[Path | None, Flag(metavar="NAME|FILE")] = None
-    """Named world in place of the preset's: a YAML file, or the name of one in configs/worlds/
-    (ur5e_rtde, panda_fci, iiwa_fri or fast_servo). It may have a robot."""
-    algorithm: str | None = None
-    warm_start: Path | None = None
-    log_dir: Path | None = None
-
-
-class Choice(ChoiceFlags):
-    """What decides which layers there are: the word and the flags of the command, or arguments of
-    `train`."""
-
-    start: Annotated[str | None, Flag(metavar="[TASK|POLICY|RUN]", is_positional=True)] = None
-    """First word: a task (bounce by default, balance, catch, juggle, track, or one of yours, which
-    --import FILE.py names), trained from the start; a policy that comes with the package, such as
-    robust_small, from whose networks a training starts, in its environment; or a run's folder,
-    latest for the newest run, or a checkpoint in it, which continues in place. Of a resumed run,
-    flags may change only total-steps, eval-every, save-every, keep-checkpoints, eval-episodes,
-    screening-episodes, eval-seed, stop-when-solved and num-devices."""
 
 
 # Reading: what lies on what ---------------------------------------------------------------------
@@ -100,24 +65,18 @@ def read_layers(
     Raises:
       UserError: as `find_start` and `layers_on`.
     """
-    start = find_start(
-        choice.start, choice.warm_start, choice.algorithm, choice.log_dir, whole_config
-    )
-    return layers_on(start, choice.config, choice.robot, choice.world, machine, whole_config)
+    return layers_on(find_start(choice, whole_config), choice, machine, whole_config)
 
 
 def layers_on(
     start: Start,
-    config: Sequence[Path] = (),
-    robot: Path | None = None,
-    world: Path | None = None,
+    choice: Choice,
     machine: Path | None = None,
     whole_config: TrainConfig | None = None,
 ) -> "Layers":
-    """The layers on a start, without what the user says.
+    """The layers on the start of a choice, without what the user says.
 
     Args:
-      config: presets and files, see `Choice`, as are `robot` and `world`.
       machine: the machine's preset; None asks JAX, which starts its devices.
       whole_config: a config that takes the place of files, and stands alone.
 
@@ -125,12 +84,16 @@ def layers_on(
       UserError: a file is missing, wrong, or of another start; or the start has what is given.
     """
     if start.resumed is not None:
-        given = {"config": config or whole_config, "robot": robot, "world": world}
+        given = {
+            "config": choice.config or whole_config,
+            "robot": choice.robot,
+            "world": choice.world,
+        }
         for name, value in given.items():
             if value:
                 raise beside_run(start.run, name)
         return Layers(start, (Layer(f"the run {start.run}", start.resumed.model_dump()),))
-    if start.policy is not None and robot is not None:
+    if start.policy is not None and choice.robot is not None:
         raise UserError(
             "a warm start and a robot cannot be combined, as the policy brings its arm; leave "
             "the robot out"
@@ -140,7 +103,7 @@ def layers_on(
     if whole_config is not None:
         files = [Layer("config", whole_config.model_dump(), whole=("env", "ppo"))]
     else:
-        found = preset_files(config, start.task_name, machine)
+        found = preset_files(choice.config, start.task_name, machine)
         machines = _layers_of_files([found.machine])
         named = _layers_of_files([found.named])
         files = _layers_of_files(found.own)
@@ -148,7 +111,7 @@ def layers_on(
             _check_start(layer, start)
     changed = _changed_defaults(start.algorithm_config)
     trained = None if start.policy is None else start.policy.env
-    of_env = layers_of_environment(start.task, trained, robot, world)
+    of_env = layers_of_environment(start.task, trained, choice.robot, choice.world)
     for layer in of_env.robot:
         _check_start(layer, start)
     policies = [_with_networks(layer, start) for layer in of_env.policy]
@@ -262,7 +225,7 @@ class Layers:
     @functools.cached_property
     def fields(self) -> dict[str, FieldInfo]:
         """The settings that there are, by dotted key."""
-        return fields_of(self.start.task.Config, self.start.algorithm_config)
+        return self.start.fields
 
     @property
     def title(self) -> str:

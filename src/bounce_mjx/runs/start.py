@@ -2,16 +2,60 @@
 
 import os
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
+from pydantic.fields import FieldInfo
+
+from bounce_mjx.config.command_line import Flag
+from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.config.user_code import not_imported, own_name
 from bounce_mjx.errors import UserError, shorten, suggest
 from bounce_mjx.learning.config import PPO_NAME, PPOConfig
 from bounce_mjx.learning.registry import find_algorithm, own_algorithm
 from bounce_mjx.resources import POLICIES, policy_folder
-from bounce_mjx.runs.config import TrainConfig, code_of, is_code_of, load_run_config, runs_folder
+from bounce_mjx.runs.config import (
+    TrainConfig,
+    code_of,
+    fields_of,
+    is_code_of,
+    load_run_config,
+    runs_folder,
+)
 from bounce_mjx.task.registry import DEFAULT, find_task, is_task, registered_tasks, task_name
 from bounce_mjx.task.task import Task
+
+
+class ChoiceFlags(StrictModel):
+    """The flags that decide which layers there are. The last three are keys of the config, too: the
+    algorithm's class, the policy of a warm start, and where latest is looked for."""
+
+    config: Annotated[tuple[Path, ...], Flag(metavar="NAME|FILE", is_repeated=True)] = ()
+    """Preset, such as cpu or finetune (a YAML file in configs/), or a YAML file of yours. A task's
+    own preset of that name, such as configs/track/cpu.yaml, takes its place. The default is default
+    on an accelerator, and cpu on a CPU. A file of yours lies on that default, or on the preset that
+    its key base names. Given again, each file lies on those before it."""
+    robot: Annotated[Path | None, Flag(metavar="NAME|FILE")] = None
+    """Config of a robot on top of the preset: the file that bounce-mjx adopt wrote, or the name of
+    one in configs/robots/ (ur5e, panda or iiwa)."""
+    world: Annotated[Path | None, Flag(metavar="NAME|FILE")] = None
+    """Named world in place of the preset's: a YAML file, or the name of one in configs/worlds/
+    (ur5e_rtde, panda_fci, iiwa_fri or fast_servo). It may have a robot."""
+    algorithm: str | None = None
+    warm_start: Path | None = None
+    log_dir: Path | None = None
+
+
+class Choice(ChoiceFlags):
+    """What decides which layers there are: the word and the flags of the command, or arguments of
+    `train`."""
+
+    start: Annotated[str | None, Flag(metavar="[TASK|POLICY|RUN]", is_positional=True)] = None
+    """First word: a task (bounce by default, balance, catch, juggle, track, or one of yours, which
+    --import FILE.py names), trained from the start; a policy that comes with the package, such as
+    robust_small, from whose networks a training starts, in its environment; or a run's folder,
+    latest for the newest run, or a checkpoint in it, which continues in place. Of a resumed run,
+    flags may change only total-steps, eval-every, save-every, keep-checkpoints, eval-episodes,
+    screening-episodes, eval-seed, stop-when-solved and num-devices."""
 
 
 class Start(NamedTuple):
@@ -35,25 +79,25 @@ class Start(NamedTuple):
     notes: tuple[str, ...] = ()
     """Which run latest stands for."""
 
+    @property
+    def fields(self) -> dict[str, FieldInfo]:
+        """The settings that a training from here has, by dotted key."""
+        return fields_of(self.task.Config, self.algorithm_config)
 
-def find_start(
-    word: str | None = None,
-    warm_start: Path | None = None,
-    algorithm: str | None = None,
-    log_dir: Path | None = None,
-    whole_config: TrainConfig | None = None,
-) -> Start:
+
+def find_start(choice: Choice, whole_config: TrainConfig | None = None) -> Start:
     """What a word means: a task, a policy or a run; and what is said beside it.
 
     Args:
-      warm_start: a policy or a run from whose networks the training starts.
-      algorithm: its name; by default, ppo.
-      log_dir: where the newest run is looked for first.
       whole_config: whose task and algorithm these are, in place of a word.
 
     Raises:
       UserError: there is no such thing, or two of these exclude each other.
     """
+    word = choice.start
+    warm_start = choice.warm_start
+    algorithm = choice.algorithm
+    log_dir = choice.log_dir
     if word is not None and not is_task(word):
         # Imports JAX, which a task's help does not need.
         from bounce_mjx.runs.folders import LATEST, is_newest
