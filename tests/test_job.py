@@ -70,7 +70,7 @@ class CountingTrainer:
     def start(self, state, networks):
         self.state = np.int32(0) if state is None else state
 
-    def run(self):
+    def train_block(self):
         names = (
             "fault",
             "episode/ended",
@@ -94,10 +94,10 @@ def before(iteration: int, act: Callable) -> type[CountingTrainer]:
     """A trainer that calls `act` before it trains an iteration."""
 
     class Acting(CountingTrainer):
-        def run(self):
+        def train_block(self):
             if self.state == iteration - 1:
                 act()
-            return super().run()
+            return super().train_block()
 
     return Acting
 
@@ -364,15 +364,15 @@ def test_a_training_stops_once_its_results_have_a_margin(tmp_path: Path) -> None
 
 def test_settings_that_cannot_be_trained_are_refused_before_a_save(tmp_path: Path) -> None:
     class Falling(CountingTrainer):
-        def run(self):
-            return super().run() | {"episode/ended": np.full((1, 1), float(BLOCK))}
+        def train_block(self):
+            return super().train_block() | {"episode/ended": np.full((1, 1), float(BLOCK))}
 
     class OtherUnit(CountingTrainer):
         """A reward in mm for m, among terms that are in order."""
 
-        def run(self):
+        def train_block(self):
             terms = {"reward/alive": 1.0, "reward/height": -2e5}
-            return super().run() | {name: np.full((1, 1), x) for name, x in terms.items()}
+            return super().train_block() | {name: np.full((1, 1), x) for name, x in terms.items()}
 
     with pytest.raises(UserError, match="these settings cannot be trained: an episode lasts 0.01"):
         train(tmp_path, RETURNS, trainer=Falling)
@@ -381,7 +381,7 @@ def test_settings_that_cannot_be_trained_are_refused_before_a_save(tmp_path: Pat
     assert not list(tmp_path.iterdir())
     # Its scale counts.
     ppo = PPOConfig(num_envs=8, rollout_length=8, num_minibatches=2, reward_scale=0.04)
-    metrics = OtherUnit.run(OtherUnit(TrainConfig(ppo=ppo), None))
+    metrics = OtherUnit.train_block(OtherUnit(TrainConfig(ppo=ppo), None))
     assert first_block_fault(metrics, TrainConfig(ppo=ppo)) is None
 
 
@@ -576,7 +576,7 @@ def test_a_folder_that_is_moved_during_a_training_is_not_made_again(tmp_path: Pa
     moved = tmp_path / "moved"
 
     class Moved(CountingTrainer):
-        def run(self):
+        def train_block(self):
             if self.state == 1:
                 (run,) = (tmp_path / "runs").iterdir()
                 while not (run / "results.json").exists():
@@ -585,7 +585,7 @@ def test_a_folder_that_is_moved_during_a_training_is_not_made_again(tmp_path: Pa
             if self.state == 3:
                 assert not list((tmp_path / "runs").iterdir())
                 moved.rename(self.place[1])
-            return super().run()
+            return super().train_block()
 
     run = train(tmp_path / "runs", RETURNS, trainer=Moved, said=(said := io.StringIO()))
     assert "cannot be written (it was moved or removed)" in said.getvalue()
@@ -595,7 +595,7 @@ def test_a_folder_that_is_moved_during_a_training_is_not_made_again(tmp_path: Pa
 def test_a_named_checkpoint_is_the_one_that_is_resumed(tmp_path: Path) -> None:
     """What was trained after it counts no more, even if it was better."""
     run = train(tmp_path, {1: 9.0, 2: 1.0})
-    with pytest.raises(UserError, match="there is no checkpoint folder"):
+    with pytest.raises(UserError, match="there is no run and no policy"):
         train(tmp_path, RETURNS, run / "checkpoints/192")
     train(tmp_path, {1: 9.0, 2: 3.0, 3: 2.0}, run / "checkpoints/64")
     assert evaluated_steps(run) == [64, 128, 192]

@@ -192,7 +192,8 @@ def test_a_warm_start_is_alike_in_a_file(folder: Path) -> None:
     own = load_run_config(find_checkpoint("robust_small").run)
     (folder / "warm.yaml").write_text("warm_start: robust_small\nenv: {action_scale: 0.03}")
     with pytest.raises(
-        UserError, match="warm.yaml starts from robust_small; give --warm-start rob"
+        UserError,
+        match="warm.yaml is of the warm_start robust_small, .* of none; give --warm-start rob",
     ):
         settings_of(["--config", "warm.yaml"])
     configs = [
@@ -317,7 +318,10 @@ def test_a_mistake_names_the_layer_that_has_it(folder: Path, refused) -> None:
     (folder / "dots.yaml").write_text("reward.height.weight: 1")
     refused("train --config dots.yaml", "nest it: env: {reward: {height: {weight: ...}}}")
     (folder / "d.yaml").write_text("warm_start: no")
-    refused("train --config d.yaml", "error: d.yaml starts from False; give --warm-start")
+    refused(
+        "train --config d.yaml",
+        "error: d.yaml is of the warm_start False, and this training of none; give --warm-start",
+    )
     (folder / "e.yaml").write_text("log_dir: 5")
     refused("train --config e.yaml", "error: e.yaml: log_dir is 5, but must be a path")
 
@@ -455,7 +459,7 @@ def test_what_a_file_cannot_say_is_told(folder: Path, refused) -> None:
     (folder / "my.yaml").write_text("task: null")
     refused(line, "my.yaml: task is None, but must be a name")
     (folder / "run").mkdir()
-    refused("train run --log-dir typo", "log_dir is where the newest run is looked for")
+    refused("train run --log-dir typo", "--log-dir is where the newest run is looked for")
 
 
 def test_no_setting_of_a_task_takes_a_flag_of_the_algorithms(folder: Path) -> None:

@@ -38,7 +38,7 @@ class EvalCommand(WhichPolicy):
     """Episodes, each from its own reset."""
     seed: NonNegativeInt = evaluation.DEFAULT_SEED
     """Seed of the resets."""
-    nominal: bool = False
+    nominal: Annotated[bool, Flag(excludes=("world", "randomization"))] = False
     """Evaluate without domain randomisation, and with the task's default goals where the policy
     was trained with them. Without this flag, each episode samples its world and goals, as in
     training."""
@@ -54,7 +54,7 @@ class EvalCommand(WhichPolicy):
     package and for the mirror law, here."""
     physics: evaluation.Physics = "config"
     """Physics engine: mujoco is MuJoCo's C engine; config is the engine used in training."""
-    json_file: Annotated[Path | None, Flag(name="json", instead_of="--out")] = None
+    json_file: Annotated[Path | None, Flag(name="json", instead_of=("--out",))] = None
     """File to write the results to."""
 
 
@@ -88,7 +88,7 @@ def main(args: Sequence[str]) -> None:
 
     check_output(command.json_file, "--json")
     console = stdout()
-    world = world_of_flags(command.nominal, command.world, command.randomization)
+    world = world_of_flags(command.world, command.randomization)
     command.check_log_dir(command.checkpoint)
     checkpoint = command.choose(command.checkpoint, command.robot)
     config = command.config_of(checkpoint, command.robot, world)

@@ -16,7 +16,7 @@ class ExportCommand(WhichPolicy):
     policy that comes with the package: pretrained, robust, robust_small, or the name of a task or
     an arm. The default is the newest run, or the task's policy in the package if there is no
     run."""
-    onnx: Annotated[Path, Flag(instead_of="--out")] = Path("policy.onnx")
+    onnx: Annotated[Path, Flag(instead_of=("--out",))] = Path("policy.onnx")
     """ONNX file to write: normaliser, network and clipping in one graph, and metadata."""
 
 

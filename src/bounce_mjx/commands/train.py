@@ -4,7 +4,6 @@ The words are read once (`read_command`): what the training begins with, the fla
 that are said. `TrainCommand.settings` puts these on a machine's preset and the user's files.
 """
 
-import itertools
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -119,7 +118,6 @@ def read_command(args: Sequence[str]) -> TrainCommand:
     """
     helps = {"-h", "--help", "--help-all"}.intersection(args)
     words = [word for word in args if word not in helps]
-    _refuse_flags_of_the_word(words)
     word, after_word = _split_word(words)
     flags_of_choice = parse(ChoiceFlags, after_word, prog=PROG, is_first=True)
     choice = Choice(start=word, **dict(flags_of_choice))
@@ -145,15 +143,6 @@ def _split_word(words: Sequence[str]) -> tuple[str | None, Sequence[str]]:
     if words and not words[0].startswith("-"):
         return words[0], words[1:]
     return None, words
-
-
-def _refuse_flags_of_the_word(words: Sequence[str]) -> None:
-    """Refuses the flags in whose place the first word stands."""
-    for word, following in itertools.zip_longest(words, words[1:]):
-        flag, _, value = word.partition("=")
-        if flag in ("--task", "--resume"):
-            what = {"--task": "the task", "--resume": "the run to resume"}[flag]
-            raise UserError(f"{what} is the first word: {PROG} {value or following or 'WORD'}")
 
 
 def _print_help(fields: Mapping[str, FieldInfo], config: TrainConfig, is_short: bool) -> NoReturn:
@@ -192,7 +181,6 @@ def print_config(config: TrainConfig) -> None:
         it starts.
     """
     config.ppo.check_rollout(config.training_episode_steps)
-    config.check_eval_seed()
     remarks = dict(config.sources)
     for key, steps in config.rounded_steps.items():
         if steps != getattr(config, key):

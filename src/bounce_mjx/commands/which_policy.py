@@ -46,6 +46,7 @@ MirrorRobot = Annotated[
 
 OtherWorld = Annotated[
     Path | None,
+    Flag(excludes=("randomization",)),
     Field(
         description="World in place of that of the training: a YAML file, or the name of one in "
         "configs/worlds/ (ur5e_rtde, panda_fci, iiwa_fri or fast_servo)."
@@ -61,17 +62,13 @@ OtherRandomization = Annotated[
 """Type of the flags for a what-if world."""
 
 
-def world_of_flags(nominal: bool, world: Path | None, randomization: RandomizationConfig) -> World:
+def world_of_flags(world: Path | None, randomization: RandomizationConfig) -> World:
     """The world that a command's flags ask for; `AS_TRAINED` without one. --nominal is an option of
     the evaluation, `EvaluationOptions.nominal`, which fixes the goals too.
 
     Raises:
-      UserError: several are given, or what is given of --randomization has no term to act on.
+      UserError: what is given of --randomization has no term to act on.
     """
-    flags = {"--nominal": nominal, "--world": world, "--randomization": randomization.terms}
-    given = [flag for flag, value in flags.items() if value]
-    if len(given) > 1:
-        raise UserError(f"{' and '.join(given)} cannot be combined; omit one")
     if randomization.terms:
         return randomization
     if randomization != RandomizationConfig():
@@ -151,15 +148,10 @@ class WhichPolicy(StrictModel):
         Raises:
           UserError: --log-dir is given, and no path stands for the newest run.
         """
-        if self.log_dir is None:
-            return
-        from bounce_mjx.runs.folders import is_newest
+        if self.log_dir is not None:
+            from bounce_mjx.runs.folders import check_newest
 
-        if not any(map(is_newest, paths)):
-            raise UserError(
-                f"--log-dir is where the newest run is looked for, and {paths[0]} is named; omit "
-                "one of them"
-            )
+            check_newest(paths)
 
     def choose(self, path: Path | None, robot: Path | None = None) -> "Checkpoint":
         """`choose_checkpoint`, or `MIRROR_LAW` for the word mirror.
@@ -176,7 +168,7 @@ class WhichPolicy(StrictModel):
         if str(path) == MIRROR and not is_folder:
             return MIRROR_LAW
         if path is not None and not is_folder and (near := suggest(str(path), [MIRROR])):
-            raise UserError(f"there is no checkpoint folder and no policy {path}; {near}")
+            raise UserError(f"there is no run and no policy {path}; {near}")
         if robot is not None:
             raise UserError("--robot is for the mirror law; omit it, or give mirror as checkpoint")
         return choose_checkpoint(path, self.folder)

@@ -41,7 +41,7 @@ from bounce_mjx.runs.config import (
     TrainConfig,
 )
 from bounce_mjx.runs.presets import BASE, SOURCES, preset_files, read_config_file, shown_file
-from bounce_mjx.runs.start import Choice, Start, beside_run, find_start
+from bounce_mjx.runs.start import Choice, Start, find_start
 from bounce_mjx.runs.worlds import layers_of_environment
 from bounce_mjx.world.named import without_idle_curriculum
 
@@ -81,23 +81,10 @@ def layers_on(
       whole_config: a config that takes the place of files, and stands alone.
 
     Raises:
-      UserError: a file is missing, wrong, or of another start; or the start has what is given.
+      UserError: a file is missing, wrong, or of another start.
     """
     if start.resumed is not None:
-        given = {
-            "config": choice.config or whole_config,
-            "robot": choice.robot,
-            "world": choice.world,
-        }
-        for name, value in given.items():
-            if value:
-                raise beside_run(start.run, name)
         return Layers(start, (Layer(f"the run {start.run}", start.resumed.model_dump()),))
-    if start.policy is not None and choice.robot is not None:
-        raise UserError(
-            "a warm start and a robot cannot be combined, as the policy brings its arm; leave "
-            "the robot out"
-        )
     machines: list[Layer] = []
     named: list[Layer] = []
     if whole_config is not None:
@@ -131,24 +118,19 @@ def _check_start(layer: Layer, start: Start) -> None:
       UserError: it is of another task, or of an algorithm or a warm start that the user does not
         name.
     """
-    task = layer.values.get("task", start.task_name)
-    algorithm = layer.values.get("algorithm", start.algorithm_name)
-    warm_start = layer.values.get("warm_start")
-    if task != start.task_name:
-        raise UserError(
-            f"{layer.source} is of the task {task}, and this training of {start.task_name}; give "
-            f"{task} as the first word, or remove the key"
-        )
-    if algorithm != start.algorithm_name and "algorithm" not in start.said:
-        raise UserError(
-            f"{layer.source} is of the algorithm {algorithm}; give --algorithm {algorithm}, or "
-            "remove the key"
-        )
-    if warm_start is not None and start.warm_start is None:
-        raise UserError(
-            f"{layer.source} starts from {warm_start}; give --warm-start {warm_start}, or remove "
-            "the key"
-        )
+    begun = {
+        "task": (start.task_name, "{} as the first word"),
+        "algorithm": (start.algorithm_name, "--algorithm {}"),
+        "warm_start": (start.warm_start, "--warm-start {}"),
+    }
+    for key, (ours, remedy) in begun.items():
+        theirs = layer.values.get(key)
+        wins = key != "task" and key in start.said
+        if theirs is not None and theirs != ours and not wins:
+            raise UserError(
+                f"{layer.source} is of the {key} {theirs}, and this training of {ours or 'none'}; "
+                f"give {remedy.format(theirs)}, or remove the key"
+            )
 
 
 def _layers_of_files(files: Iterable[Path | None]) -> list[Layer]:

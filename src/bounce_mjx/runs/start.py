@@ -49,7 +49,10 @@ class Choice(ChoiceFlags):
     """What decides which layers there are: the word and the flags of the command, or arguments of
     `train`."""
 
-    start: Annotated[str | None, Flag(metavar="[TASK|POLICY|RUN]", is_positional=True)] = None
+    start: Annotated[
+        str | None,
+        Flag(metavar="[TASK|POLICY|RUN]", is_positional=True, instead_of=("--task", "--resume")),
+    ] = None
     """First word: a task (bounce by default, balance, catch, juggle, track, or one of yours, which
     --import FILE.py names), trained from the start; a policy that comes with the package, such as
     robust_small, from whose networks a training starts, in its environment; or a run's folder,
@@ -109,10 +112,7 @@ def find_start(choice: Choice, whole_config: TrainConfig | None = None) -> Start
                 )
             warm_start, word = Path(word), None
         elif is_newest(Path(word)) or os.path.isdir(word):
-            for name, given in {"warm_start": warm_start, "algorithm": algorithm}.items():
-                if given is not None:
-                    raise beside_run(word, name)
-            return _start_of_run(Path(word), log_dir)
+            return _start_of_run(Path(word), choice, whole_config)
         else:
             known = list(dict.fromkeys((*registered_tasks(), *POLICIES)))
             own = "a run's folder, or --import FILE.py for a task of your own"
@@ -154,23 +154,20 @@ def find_start(choice: Choice, whole_config: TrainConfig | None = None) -> Start
     )
 
 
-def beside_run(run: str | os.PathLike, name: str) -> UserError:
-    """The refusal of what a run has already, with which it is resumed."""
-    return UserError(
-        f"the run {run} has its {name}, with which it is resumed; leave {name} out, or start a new "
-        f"run from its networks: --warm-start {run}"
-    )
-
-
-def _start_of_run(word: Path, log_dir: Path | None) -> Start:
+def _start_of_run(word: Path, choice: Choice, whole_config: TrainConfig | None) -> Start:
     """The start of a run that is resumed."""
-    from bounce_mjx.runs.folders import is_newest, run_of, run_or_newest
+    from bounce_mjx.runs.folders import check_newest, run_of, run_or_newest
 
-    if log_dir is not None and not is_newest(word):
-        raise UserError(
-            f"log_dir is where the newest run is looked for, and {word} is named; omit one of them"
-        )
-    place = run_or_newest(word, log_dir or runs_folder(find_task(DEFAULT)))
+    if choice.log_dir is not None:
+        check_newest([word])
+    has_its_own = dict(choice) | {"config": choice.config or whole_config}
+    for name in ("config", "robot", "world", "algorithm", "warm_start"):
+        if has_its_own[name]:
+            raise UserError(
+                f"the run {word} has its {name}, with which it is resumed; leave {name} out, or "
+                f"start a new run from its networks: --warm-start {word}"
+            )
+    place = run_or_newest(word, choice.log_dir or runs_folder(find_task(DEFAULT)))
     run = run_of(place)
     config = load_run_config(run)
     classes: dict[str, type] = {"task": config.env.task}

@@ -54,10 +54,11 @@ def env_in_world(
       robot: of a task: a file, or a name in configs/robots/.
 
     Raises:
-      UserError: the robot or the world is missing or wrong, the world is of another robot, a term
-        does not fit the arm, or a task has no training's worlds.
+      UserError: the robot or the world is missing or wrong, the world is of another robot, a policy
+        or a term does not fit the arm, or a task has no training's worlds.
     """
     if isinstance(start, WorldConfig):
+        _check_one_robot(start, robot)
         if world is AS_TRAINED:
             return start
         if world == NOMINAL:
@@ -77,6 +78,14 @@ def env_in_world(
         )
     named = None if world in (AS_TRAINED, NOMINAL) else Path(world)
     return _merged(start.Config, layers_of_environment(start, None, robot, named))
+
+
+def _check_one_robot(trained: WorldConfig | None, robot: Path | None) -> None:
+    """Raises UserError for a robot beside that of a policy or a config."""
+    if trained is not None and robot is not None:
+        raise UserError(
+            f"the robot {robot} is given, and a policy or a config brings its own; leave robot out"
+        )
 
 
 def _merged(config_class: type[WorldConfig], layers: EnvironmentLayers) -> WorldConfig:
@@ -102,6 +111,7 @@ def layers_of_environment(
     Raises:
       UserError: one of them is missing or wrong, or the world is of another robot.
     """
+    _check_one_robot(trained, robot)
     policies = [] if trained is None else [_layer_of_policy(trained, world is not None)]
     robots = []
     if robot is not None:

@@ -215,10 +215,8 @@ def run_training(
     """Trains with a config, which has its settings from layers, and returns the run.
 
     Raises:
-      UserError: the training would choose its checkpoint by the episodes of `bounce-mjx eval`, or
-        as `job.train`.
+      UserError: as `job.train`.
     """
-    config.check_eval_seed()
     resume = layers.start.run
     if resume is None:
         say(console, f"config: {layers.title}")

@@ -31,7 +31,7 @@ class Trainer(Protocol):
 
     The job asks the algorithm for one (`Algorithm.make_trainer`), which may raise a UserError where
     the config does not fit. Then it calls
-    `compile`, `start` once, and `run` for each block. It may ask for `state_template` at any time,
+    `compile`, `start` once, and `train_block` for each block. It may ask for `state_template` at any time,
     and after `start` for a `snapshot`.
     """
 
@@ -56,7 +56,7 @@ class Trainer(Protocol):
             their inputs (`checkpoints.read_start`); not with a state.
         """
 
-    def run(self) -> BlockMetrics:
+    def train_block(self) -> BlockMetrics:
         """Trains for a block of I iterations (`TrainConfig.iterations_per_block`), each of
         `ppo.batch_steps` environment steps.
 
