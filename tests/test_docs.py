@@ -143,8 +143,8 @@ def test_shown_commands_are_understood(command, monkeypatch: pytest.MonkeyPatch)
     # Playground's own program reads its flags.
     if not args or args == ["--help"] or name == "bounce_mjx.adapters.playground":
         return
-    for flag in {"--import", "--robot", "--world"} & set(args):  # their files would have to exist
-        at = args.index(flag)
+    if "--import" in args:  # its file would have to exist
+        at = args.index("--import")
         args = args[:at] + args[at + 2 :]
     # A module that the command imports below would keep the changed function.
     for info in pkgutil.iter_modules(commands_package.__path__):

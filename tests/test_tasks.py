@@ -17,6 +17,7 @@ import pytest
 
 import rest_task
 from bounce_mjx import load_policy, task
+from bounce_mjx.commands import train as train_command
 from bounce_mjx.commands.eval import EvalCommand
 from bounce_mjx.commands.goals import parse_with_goals
 from bounce_mjx.commands.main import main
@@ -1057,9 +1058,10 @@ def test_a_task_may_name_a_goal_or_a_setting_like_a_flag(
     assert command.episodes == 7
     assert given.checked(env) == {"episodes": 0.5, "model_config": 1.0, "size": 0.1}
     flags = "--no-report --env.report 0.25 --seed 8 --env.seed 9".split()
-    command = settings_of(["sized", *flags])
-    assert (command.flags.report, command.config.seed) == (False, 8)
-    assert (command.config.env.report, command.config.env.seed) == (0.25, 9)
+    command = train_command.read_command(["sized", *flags])
+    config = command.settings().config
+    assert (command.flags.report, config.seed) == (False, 8)
+    assert (config.env.report, config.env.seed) == (0.25, 9)
 
 
 class _Rising(rest_task.Rest):

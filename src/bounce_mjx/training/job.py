@@ -271,8 +271,8 @@ class Job:
                     self.say(f"the damaged checkpoint is kept as {aside}")
 
     def write_configs(self) -> None:
-        """Makes the folders of the seeds, and writes the config of each, and of a resumed run, whose
-        length may have changed."""
+        """Makes the folders of the seeds, and writes the config of each, and of a resumed run,
+        whose length may have changed."""
         if not hosts.is_leader():
             return
         configs = self.configs_by_folder()

@@ -30,9 +30,8 @@ class Trainer(Protocol):
     the config's `ppo` describes.
 
     The job asks the algorithm for one (`Algorithm.make_trainer`), which may raise a UserError where
-    the config does not fit. Then it calls
-    `compile`, `start` once, and `train_block` for each block. It may ask for `state_template` at any time,
-    and after `start` for a `snapshot`.
+    the config does not fit. Then it calls `compile`, `start` once, and `train_block` for each
+    block. It may ask for `state_template` at any time, and after `start` for a `snapshot`.
     """
 
     checked: Sequence[str]
