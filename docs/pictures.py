@@ -281,6 +281,7 @@ def two_policies():
     from bounce_mjx.deploy.environments import environment_config
     from bounce_mjx.deploy.session import play
     from bounce_mjx.rehearsal.arm import SimulatedArm, goals_in_turn
+    from bounce_mjx.rehearsal.operator import SimulatedOperator
 
     late = {"camera_rate": 120.0, "ball_position_noise": 0.002, "ball_latency": 0.02}
     figure, row = plt.subplots(1, 2, figsize=(8.4, 3.0), layout="constrained", sharey=True)
@@ -293,7 +294,7 @@ def two_policies():
             config = environment_config(policy=name)
             arm = SimulatedArm(config, world)
             goals = goals_in_turn(config, {"target_height": (0.5,)})
-            play(load_policy(name), arm, 5.0, arm.is_told, goals, {})
+            play(load_policy(name), arm, 5.0, SimulatedOperator(arm), goals, {})
             height = arm.balls[0].qpos[2]
             time, shown = np.array([(moved.time, moved.qpos[height]) for moved in arm.path]).T
             axes.plot(time, shown, color=colour, lw=1.6, label=name)

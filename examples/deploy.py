@@ -20,6 +20,7 @@ from bounce_mjx.deploy.recorder import Recorder
 from bounce_mjx.deploy.session import play
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.rehearsal.arm import SimulatedArm, goals_in_turn, middle
+from bounce_mjx.rehearsal.operator import SimulatedOperator
 from bounce_mjx.resources import resource_path
 
 MJCF = resource_path("mjcf/bounce_ball.xml")
@@ -80,7 +81,7 @@ def main() -> None:
             policy,
             arm,
             arguments.seconds,
-            is_told=arm.is_told,
+            SimulatedOperator(arm),
             goals=goals,
             box={"box": (home - BOX, home + BOX)},
             recorder=recorder,

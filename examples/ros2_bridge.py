@@ -14,16 +14,19 @@ Robots (`--tool-pose /tcp_pose_broadcaster/pose`, PoseStamped, the tool centre p
 ur_rtde_bridge.py), also tells whether it is the policy's arm. A pose of TF does not: it comes from
 /joint_states and a file.
 
-Publish a message on /start for each episode; where the arm has stopped, one sends it home first. If
-the arm was moved with its servos off, start the program again. Read "Safety" in docs/your-arm.md
-first.
+Publish a message on /start for each episode; after a lost ball, one sends the arm home first.
+After another fault the program ends; start it again, as where the arm was moved with its servos
+off. The program is `bounce_mjx.deploy.session.play`, as in a rehearsal; here is its driver alone.
+Read "Safety" in docs/your-arm.md first.
 """
 
 import argparse
+import math
 
 import numpy as np
 import rclpy
 from geometry_msgs.msg import PointStamped, PoseStamped
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.time import Time
 from sensor_msgs.msg import JointState
@@ -31,8 +34,8 @@ from std_msgs.msg import Empty, Float64MultiArray, Header
 
 from bounce_mjx import load_policy
 from bounce_mjx.deploy.box import add_box, box_of
-from bounce_mjx.deploy.faults import picture_age
-from bounce_mjx.deploy.session import heed_word
+from bounce_mjx.deploy.session import play
+from bounce_mjx.errors import UserError
 
 RATE = 500.0
 """Commands a second, Hz."""
@@ -41,42 +44,43 @@ NEWEST_ONLY = 1
 
 
 class Bridge(Node):
-    """Takes the newest messages once each control step, and publishes one command in each tick."""
+    """A driver (`bounce_mjx.deploy.session.Arm`), and an operator (`session.Operator`) on /start.
+    It publishes one command in each tick, and takes messages meanwhile."""
+
+    rate = RATE
 
     def __init__(
         self,
-        policy,
+        joint_names: tuple[str, ...],
         rests_at: list[float],
-        box: dict,
         frame: str,
         tool_topic: str | None = None,
-        target_height: float = 0.7,
     ):
-        """Subscribes to the topics; `rclpy.spin` runs it.
+        """Subscribes to the topics.
 
         Args:
-          policy: the result of `load_policy`.
+          joint_names: in the policy's order [J].
           rests_at: joint angles [J] at which the operator says that the arm rests, rad.
-          box: the `box` of `DeployedPolicy.supervise`, m; empty for none.
           frame: the `frame_id` of the policy's frame.
           tool_topic: of the tool's pose by the robot's own kinematics, if it has one.
-          target_height: m.
         """
         super().__init__("bounce_mjx")
-        self.joint_names = policy.metadata.joint_names
-        policy.reset(np.array(rests_at))
-        self.arm = policy.supervise(RATE, **box)
+        self.joint_names = joint_names
+        self.rests_at = np.array(rests_at)
         self.frame = frame
-        self.measurements = {"target_height": target_height}
+        self.measurements: dict = {}
         self.awaited = {"joint_angles"}
         """What has to be measured before the first command."""
-        self.max_first_ball_age = picture_age(policy.metadata)
+        self.refusal: str | None = None
+        """Why a message is not of this arm."""
         self.joint_stamp = None
         """When the newest joint angles were measured."""
         self.picture_stamp = None
         """When the newest picture of the ball was taken."""
-        self.commands = []
-        """What is still to be published in this control step, each [J], rad."""
+        self.is_told = False
+        """Whether a message on /start has come since the last look."""
+        self.has_ticked = False
+        """Whether a period has ended since the last command."""
         self.create_subscription(JointState, "/joint_states", self.on_joints, NEWEST_ONLY)
         self.create_subscription(PointStamped, "/ball", self.on_ball, NEWEST_ONLY)
         self.create_subscription(Empty, "/start", self.on_start, NEWEST_ONLY)
@@ -86,7 +90,64 @@ class Bridge(Node):
         self.publisher = self.create_publisher(
             Float64MultiArray, "/forward_position_controller/commands", NEWEST_ONLY
         )
-        self.create_timer(1.0 / RATE, self.tick)
+        self.create_timer(1.0 / RATE, self.on_tick)
+        # Node.executor would keep no reference to it.
+        self.messages = SingleThreadedExecutor()
+        self.messages.add_node(self)
+
+    def targets(self) -> np.ndarray:
+        """As `Arm.targets`."""
+        return self.rests_at
+
+    def measure(self) -> dict:
+        """As `Arm.measure`: with the time of the joint angles, which stands where none come, and
+        the age of the ball's picture by then, s. It waits for the first message of each kind."""
+        while self.refusal is None and not self.awaited <= self.measurements.keys():
+            self.messages.spin_once()
+        if self.refusal is not None:
+            raise UserError(self.refusal)
+        measurements = dict(self.measurements)
+        now = Time.from_msg(self.joint_stamp)
+        measurements["time"] = now.nanoseconds * 1e-9
+        if self.picture_stamp is not None:
+            ball_age = now - Time.from_msg(self.picture_stamp)
+            measurements["ball_age"] = ball_age.nanoseconds * 1e-9
+        return measurements
+
+    def send(self, commands: np.ndarray) -> None:
+        """As `Arm.send`."""
+        for command in commands:
+            self.publisher.publish(Float64MultiArray(data=command.tolist()))
+            self.wait()
+        if len(commands) == 0:
+            self.wait()
+
+    def wait(self) -> None:
+        """Takes messages until the next tick."""
+        self.has_ticked = False
+        while not self.has_ticked:
+            self.messages.spin_once()
+
+    def on_tick(self) -> None:
+        """A period has ended."""
+        self.has_ticked = True
+
+    def stop(self) -> None:
+        """As `Arm.stop`: the controller holds the arm at the last command."""
+
+    def has_word(self, state: str) -> bool:
+        """As `Operator.has_word`."""
+        was_told = self.is_told
+        self.is_told = False
+        return was_told
+
+    def hear(self, words: str) -> None:
+        """As `Operator.hear`."""
+        self.get_logger().info(words)
+
+    def on_start(self, message: Empty) -> None:
+        """The operator gives the word."""
+        self.is_told = True
 
     def on_joints(self, message: JointState) -> None:
         """Takes the arm's angles; a message of other joints, such as a gripper's, has none."""
@@ -105,7 +166,7 @@ class Bridge(Node):
         """Whether a message is in the policy's frame; if not, the arm stops."""
         if header.frame_id == self.frame:
             return True
-        self.arm.stop(
+        self.refusal = (
             f"{topic} has the frame_id {header.frame_id!r}, not {self.frame!r}; transform it, or "
             "give the policy's frame with --frame"
         )
@@ -132,44 +193,12 @@ class Bridge(Node):
         self.measurements["ball_position"] = [point.x, point.y, point.z]
         self.picture_stamp = message.header.stamp
 
-    def on_start(self, message: Empty) -> None:
-        """Starts an episode where the arm is ready, and sends it home where it has stopped."""
-        if self.arm.state == "stopped":
-            self.get_logger().info(f"stopped as {self.arm.reason}; going home")
-        ball_age = self.timed_measurements().get("ball_age", np.inf)
-        refused = heed_word(self.arm, ball_age, self.max_first_ball_age)
-        if refused is not None:
-            self.get_logger().info(f"nothing starts: {refused}")
-
-    def tick(self) -> None:
-        """Publishes the next command; after the last one, a new control step begins."""
-        if not self.awaited <= self.measurements.keys():
-            return
-        if not self.commands:
-            self.commands = list(self.arm.commands(self.timed_measurements()))
-        if not self.commands:
-            # The first sample is not believed yet, and nothing is sent.
-            return
-        command = self.commands.pop(0)
-        self.publisher.publish(Float64MultiArray(data=command.tolist()))
-
-    def timed_measurements(self) -> dict:
-        """The newest measurements, with the time of the joint angles, which stands where none come,
-        and the age of the ball's picture by then, s."""
-        measurements = dict(self.measurements)
-        if self.joint_stamp is None:
-            return measurements
-        now = Time.from_msg(self.joint_stamp)
-        measurements["time"] = now.nanoseconds * 1e-9
-        if self.picture_stamp is not None:
-            ball_age = now - Time.from_msg(self.picture_stamp)
-            measurements["ball_age"] = ball_age.nanoseconds * 1e-9
-        return measurements
-
 
 def parse_arguments(words: list[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("policy", help="name, file or run")
+    parser.add_argument("--seconds", type=float, default=math.inf)
+    parser.add_argument("--target-height", type=float, default=0.7, help="m")
     parser.add_argument("--joints", nargs="+", help="the driver's names, in its order")
     parser.add_argument(
         "--rests-at",
@@ -188,9 +217,20 @@ def parse_arguments(words: list[str] | None = None) -> argparse.Namespace:
 def main() -> None:
     arguments = parse_arguments()
     policy = load_policy(arguments.policy, joint_names=arguments.joints)
-    box = box_of(arguments)
+    goals = {"target_height": arguments.target_height}
     rclpy.init()
-    rclpy.spin(Bridge(policy, arguments.rests_at, box, arguments.frame, arguments.tool_pose))
+    bridge = Bridge(
+        policy.metadata.joint_names, arguments.rests_at, arguments.frame, arguments.tool_pose
+    )
+    session = play(
+        policy,
+        bridge,
+        arguments.seconds,
+        bridge,
+        goals=lambda elapsed: goals,
+        box=box_of(arguments),
+    )
+    bridge.hear(f"the program ended: {session.reason or 'the time is over'}")
 
 
 if __name__ == "__main__":

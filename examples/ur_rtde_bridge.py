@@ -4,7 +4,8 @@
 from UDP datagrams "x y z age" (m in the controller's feature Base, s) on port 5005 of this
 computer; for a camera on another one, give the address at which this one is reached (`--listen`).
 Each episode starts when Enter is pressed, with the hands away from the arm; after a lost ball the
-arm rests until Enter sends it home.
+arm rests until Enter sends it home. The program is `bounce_mjx.deploy.session.play`, as in a
+rehearsal; here is its driver alone.
 
 Set the tool centre point on the pendant to the paddle's centre, with its z along the paddle's upper
 normal: nothing is sent to an arm whose controller has the paddle elsewhere than the policy, such as
@@ -12,17 +13,14 @@ a UR3e under the policy of a UR5e. Read "Safety" in docs/your-arm.md first.
 """
 
 import argparse
-import select
 import socket
-import sys
 import time
-from collections.abc import Callable
 
 import numpy as np
 
 from bounce_mjx import load_policy
 from bounce_mjx.deploy.box import add_box, box_of
-from bounce_mjx.deploy.session import BALL_GONE, heed_word
+from bounce_mjx.deploy.session import Terminal, play
 
 RATE = 500.0
 """Commands a second, Hz."""
@@ -30,10 +28,6 @@ LOOKAHEAD_TIME = 0.03
 """Of `servoJ`, s: the least that it accepts, for the least delay."""
 GAIN = 300
 """Of `servoJ`, from 100 to 2000."""
-MAX_FIRST_BALL_AGE = 0.05
-"""An episode starts only with a newer picture of the ball, s."""
-OVER = "the time is over"
-"""Why the arm stops at the end."""
 # The order of RTDE's arrays.
 JOINTS = (
     "shoulder_pan_joint",
@@ -90,90 +84,67 @@ class Camera:
         self.taken = self.clock() - float(numbers[3])
 
 
-def has_pressed_enter() -> bool:
-    """Whether the operator has given the word since the last call."""
-    has_line, _, _ = select.select([sys.stdin], [], [], 0.0)
-    return bool(has_line and sys.stdin.readline())
+class UniversalRobot:
+    """A driver (`bounce_mjx.deploy.session.Arm`)."""
 
+    rate = RATE
 
-def bounce(
-    policy,
-    rtde_c,
-    rtde_r,
-    camera,
-    goals: dict,
-    seconds: float,
-    box: dict,
-    is_told: Callable[[], bool] = has_pressed_enter,
-) -> list[str]:
-    """Bounces for a time by the robot's clock, and brakes. After a lost ball the arm rests until
-    the operator's word sends it home, and another one starts an episode; another fault ends it.
+    def __init__(self, rtde_c, rtde_r, camera):
+        """The arm of two connections.
 
-    Args:
-      policy: the result of `load_policy`.
-      rtde_c: ur_rtde's `RTDEControlInterface`.
-      rtde_r: its `RTDEReceiveInterface`.
-      camera: its `measure` returns the ball's part of the measurements, its `receive` takes what
-        has arrived.
-      goals: such as the target height, m.
-      box: the `box` of `DeployedPolicy.supervise`, m; empty for none.
-      is_told: whether the operator has given the word to start since it was last asked.
+        Args:
+          rtde_c: ur_rtde's `RTDEControlInterface`.
+          rtde_r: its `RTDEReceiveInterface`.
+          camera: its `measure` returns the ball's part of the measurements, its `receive` takes
+            what has arrived.
+        """
+        self.rtde_c = rtde_c
+        self.rtde_r = rtde_r
+        self.camera = camera
+        # A period begins before reading and computing, so that a control step lasts whole periods.
+        self.period = rtde_c.initPeriod()
 
-    Returns:
-      Why the arm stopped, each time.
-    """
-    # Where the controller holds the arm, whatever its encoders say.
-    policy.reset(np.array(rtde_r.getTargetQ()))
-    arm = policy.supervise(RATE, **box)
-    reasons = []
-    was = arm.state
-    until = rtde_r.getTimestamp() + seconds
-    # A period begins before reading and computing, so that a control step lasts whole periods.
-    t_start = rtde_c.initPeriod()
-    try:
-        while True:
-            ball = camera.measure()
-            measurements = {
-                "joint_angles": rtde_r.getActualQ(),
-                "joint_velocities": rtde_r.getActualQd(),
-                "time": rtde_r.getTimestamp(),
-                **tool_of(rtde_r.getActualTCPPose()),
-                **ball,
-                **goals,
-            }
-            if measurements["time"] >= until:
-                arm.stop(OVER, OVER)
-            commands = arm.commands(measurements)
-            for joint_angles in commands:
-                servo(rtde_c, joint_angles)
-                rtde_c.waitPeriod(t_start)
-                t_start = rtde_c.initPeriod()
-                camera.receive()
-            if len(commands) == 0:
-                # The first sample is not believed yet, and nothing is sent.
-                rtde_c.waitPeriod(t_start)
-                t_start = rtde_c.initPeriod()
-            state = arm.state
-            has_changed = state != was
-            was = state
-            if state == "stopped" and arm.fault == OVER:
-                break
-            if state == "stopped" and has_changed:
-                reasons.append(arm.reason)
-                if arm.fault not in BALL_GONE:
-                    break
-                print(f"stopped as {arm.reason}; press Enter to go home, with no hand near")
-            elif state == "ready" and has_changed:
-                print("the arm is ready; press Enter to start")
-            # A word that comes in another state does not count.
-            if is_told() and state in ("ready", "stopped"):
-                refused = heed_word(arm, ball["ball_age"], MAX_FIRST_BALL_AGE)
-                if refused is not None:
-                    print(refused)
-    finally:
-        # Whatever ends the loop, the arm does not go on toward its last command.
-        rtde_c.servoStop()
-    return reasons
+    def targets(self) -> np.ndarray:
+        """As `Arm.targets`: where the controller holds the arm, whatever its encoders say."""
+        return np.array(self.rtde_r.getTargetQ())
+
+    def measure(self) -> dict:
+        """As `Arm.measure`."""
+        ball = self.camera.measure()
+        return {
+            "joint_angles": self.rtde_r.getActualQ(),
+            "joint_velocities": self.rtde_r.getActualQd(),
+            "time": self.rtde_r.getTimestamp(),
+            **tool_of(self.rtde_r.getActualTCPPose()),
+            **ball,
+        }
+
+    def send(self, commands: np.ndarray) -> None:
+        """As `Arm.send`."""
+        for joint_angles in commands:
+            self.servo(joint_angles)
+            self.wait()
+        if len(commands) == 0:
+            self.wait()
+
+    def servo(self, joint_angles: np.ndarray) -> None:
+        """Sends a command [6], rad, for the next period."""
+        # servoJ has these two arguments, and does not use them.
+        velocity = 0.0
+        acceleration = 0.0
+        self.rtde_c.servoJ(
+            joint_angles.tolist(), velocity, acceleration, 1.0 / RATE, LOOKAHEAD_TIME, GAIN
+        )
+
+    def wait(self) -> None:
+        """Until the next period."""
+        self.rtde_c.waitPeriod(self.period)
+        self.period = self.rtde_c.initPeriod()
+        self.camera.receive()
+
+    def stop(self) -> None:
+        """As `Arm.stop`."""
+        self.rtde_c.servoStop()
 
 
 def tool_of(pose: list[float]) -> dict[str, np.ndarray]:
@@ -190,14 +161,6 @@ def tool_of(pose: list[float]) -> dict[str, np.ndarray]:
     turned = np.cos(angle) * upward + np.sin(angle) * np.cross(axis, upward)
     normal = turned + (1.0 - np.cos(angle)) * axis[2] * axis
     return {"tool_position": position, "tool_normal": normal}
-
-
-def servo(rtde_c, joint_angles: np.ndarray) -> None:
-    """Sends a command [6], rad, for the next period."""
-    # servoJ has these two arguments, and does not use them.
-    velocity = 0.0
-    acceleration = 0.0
-    rtde_c.servoJ(joint_angles.tolist(), velocity, acceleration, 1.0 / RATE, LOOKAHEAD_TIME, GAIN)
 
 
 def main() -> None:
@@ -218,11 +181,21 @@ def main() -> None:
     rtde_r = RTDEReceiveInterface(arguments.robot, RATE)
     policy = load_policy(arguments.policy, joint_names=JOINTS)
     camera = Camera(address=arguments.listen)
+    robot = UniversalRobot(rtde_c, rtde_r, camera)
     goals = {"target_height": arguments.target_height}
-    print("press Enter for each episode, when the ball is over the paddle and no hand is near")
-    reasons = bounce(policy, rtde_c, rtde_r, camera, goals, arguments.seconds, box_of(arguments))
-    for reason in reasons:
-        print(reason)
+    print("the word is Enter, when the ball is over the paddle and no hand is near")
+    session = play(
+        policy,
+        robot,
+        arguments.seconds,
+        Terminal(),
+        goals=lambda elapsed: goals,
+        box=box_of(arguments),
+    )
+    for episode in session.episodes:
+        print(f"{episode.seconds:.1f} s, then {episode.reason or 'the end of the time'}")
+    if session.fault is not None or not session.episodes:
+        print(session.reason)
     print(f"{camera.ignored} datagrams were ignored")
 
 

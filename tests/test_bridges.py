@@ -1,10 +1,13 @@
 """The bridges to robots, on stand-ins of their libraries in front of MuJoCo's C engine."""
 
 import argparse
+import itertools
+import os
 import re
 import runpy
 import sys
 import types
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +17,7 @@ import pytest
 
 from bounce_mjx import load_policy
 from bounce_mjx.deploy.box import add_box, box_of
+from bounce_mjx.deploy.session import Session, Terminal, play
 from bounce_mjx.resources import resource_path
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
@@ -72,9 +76,48 @@ class World:
         self.held = arm.state not in ("running", "braking")
 
 
-def check(world: World, reasons: list[str]) -> None:
+class Watched:
+    """A policy whose supervisor is known."""
+
+    def __init__(self):
+        self.policy = load_policy("robust")
+        self.settings: list[dict[str, Any]] = []
+        self.supervisor: Any = None
+        make = self.policy.supervise
+
+        def supervise(rate: float, **settings: Any) -> Any:
+            self.settings.append(settings)
+            self.supervisor = make(rate, **settings)
+            return self.supervisor
+
+        self.policy.supervise = supervise
+
+
+class Waiting:
+    """An operator who gives the word when the arm has waited for it for half a second."""
+
+    def __init__(self):
+        self.asked: list[bool] = []
+        """Whether the arm waited, in each control step."""
+        self.heard: list[str] = []
+
+    def has_word(self, state: str) -> bool:
+        self.asked.append(state in ("ready", "stopped"))
+        return len(self.asked) >= 50 and all(self.asked[-50:])
+
+    def hear(self, words: str) -> None:
+        self.heard.append(words)
+
+
+def asked_for(time: float) -> dict[str, float]:
+    return {"target_height": 0.5}
+
+
+def check(world: World, session: Session) -> None:
     """The ball bounces, is thrown away once, and bounces again."""
-    assert len(reasons) == 1 and re.search("the ball is lost|has not fallen", reasons[0])
+    first, second = session.episodes
+    assert first.fault in ("ball_lost", "ball_flight") and second.fault is None
+    assert session.fault is None
     assert world.before >= 3 and world.bounces - world.before >= 2
     steps = np.abs(np.diff(world.commands, axis=0))
     assert steps.max() < 0.05
@@ -92,25 +135,11 @@ def rotation_vector(axes: np.ndarray) -> np.ndarray:
 def knocked(world: World) -> None:
     """Knocks the ball away in the third second."""
     if world.ticks == 3 * RATE:
-        world.ball.qvel[:2], world.before = 3.0, world.bounces
+        world.ball.qvel[:3], world.before = (3.0, 3.0, 0.0), world.bounces
 
 
 def test_ur_rtde_bridge() -> None:
-    world, supervised = World(), []
-    boxes = []
-
-    def watched_policy() -> Any:
-        policy = load_policy("robust")
-        make = policy.supervise
-
-        def supervise(rate: float, **settings: Any) -> Any:
-            boxes.append(settings)
-            supervised.append(make(rate, **settings))
-            return supervised[-1]
-
-        policy.supervise = supervise
-        return policy
-
+    world, watched = World(), Watched()
     bridge = runpy.run_path(str(EXAMPLES / "ur_rtde_bridge.py"))
 
     rests: list[int] = []
@@ -132,7 +161,7 @@ def test_ur_rtde_bridge() -> None:
         def waitPeriod(self, period: int) -> None:
             assert period == world.ticks
             self.in_period = False
-            is_stopped = supervised[-1].state == "stopped"
+            is_stopped = watched.supervisor.state == "stopped"
             if is_stopped and not self.was_stopped and world.before:
                 rests.append(0)
             rests_on = is_stopped and rests and np.array_equal(self.sent, world.commands[-1])
@@ -141,7 +170,7 @@ def test_ur_rtde_bridge() -> None:
                 rests[-1] += 1
             knocked(world)
             world.tick(self.sent)
-            world.watch(supervised[-1])
+            world.watch(watched.supervisor)
 
         def servoStop(self) -> None:
             self.stopped = True
@@ -185,34 +214,29 @@ def test_ur_rtde_bridge() -> None:
     camera.socket, camera.newest, camera.ignored = Socket(), {}, 0
     camera.clock, camera.taken = (lambda: world.time), -np.inf
     control, receive = Control(), Receive()
-    wished = {"target_height": 0.5}
-    asked = []
-
-    def is_told() -> bool:
-        """The operator gives the word when the arm has waited for it for half a second."""
-        is_ready = supervised[-1].state in ("ready", "stopped")
-        asked.append(is_ready)
-        return is_ready and all(asked[-50:]) and len(asked) >= 50
-
+    operator = Waiting()
     box = {"box": BOX}
-    policy = watched_policy()
-    reasons = bridge["bounce"](policy, control, receive, camera, wished, SECONDS, box, is_told)
+    robot = bridge["UniversalRobot"](control, receive, camera)
+    session = play(watched.policy, robot, SECONDS, operator, asked_for, box)
     # It brakes at the end, within the box of time and some more.
     assert control.stopped and 0 <= world.ticks - SECONDS * RATE <= 0.3 * RATE
     assert np.ptp(world.commands[-5:], axis=0).max() < 1e-9
     # No hand is met by an arm that went home after the lost ball before the word.
     assert len(rests) == 2 and rests[0] >= 0.49 * RATE
-    assert boxes == [box]
+    assert watched.settings == [box]
     # After the lost ball the arm was ready, and waited for the word.
-    waits = "".join("r" if is_ready else "." for is_ready in asked)
+    waits = "".join("r" if is_ready else "." for is_ready in operator.asked)
     assert len(re.findall("r{50}", waits)) == 3
-    check(world, reasons)
+    words = ["is ready", "stopped as the ball", "is ready"]
+    assert len(operator.heard) == 3
+    assert all(word in said for word, said in zip(words, operator.heard, strict=True))
+    check(world, session)
     assert camera.ignored == 5
     # After another fault, no word starts it again.
     receive.broken = True
-    policy = watched_policy()
-    reasons = bridge["bounce"](policy, control, receive, camera, wished, SECONDS, {}, is_told)
-    assert len(reasons) == 1 and "joint_velocities holds nan" in reasons[0]
+    watched = Watched()
+    session = play(watched.policy, robot, SECONDS, operator, asked_for, {})
+    assert session.fault == "measurement" and "joint_velocities holds nan" in session.reason
     assert world.ticks < 2 * SECONDS * RATE
     # A lost connection ends the program, and stops the arm first.
     control.stopped = False
@@ -222,8 +246,23 @@ def test_ur_rtde_bridge() -> None:
 
     receive.getActualQ = lose_connection
     with pytest.raises(RuntimeError, match="connection lost"):
-        bridge["bounce"](policy, control, receive, camera, wished, SECONDS, {}, is_told)
+        play(Watched().policy, robot, SECONDS, operator, asked_for, {})
     assert control.stopped
+
+
+def test_the_word_at_a_terminal_is_a_line(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    """Nothing, and the end of the input, are none."""
+    readable, writable = os.pipe()
+    with os.fdopen(readable) as lines:
+        monkeypatch.setattr("sys.stdin", lines)
+        terminal = Terminal()
+        assert not terminal.has_word("ready")
+        os.write(writable, b"\n")
+        assert terminal.has_word("ready") and not terminal.has_word("ready")
+        os.close(writable)
+        assert not terminal.has_word("ready")
+    terminal.hear("the arm is ready")
+    assert capsys.readouterr().out == "the arm is ready\n"
 
 
 def test_a_bridge_does_not_begin_at_readings_that_its_controller_contradicts() -> None:
@@ -246,9 +285,10 @@ def test_a_bridge_does_not_begin_at_readings_that_its_controller_contradicts() -
         getActualTCPPose=lambda: [0.0] * 6,
     )
     camera = message(measure=lambda: {"ball_age": np.inf}, receive=lambda: None)
-    reasons = bridge["bounce"](policy, control, receive, camera, {}, 6.0, {}, lambda: True)
-    assert not sent and len(reasons) == 1
-    assert "Joint2 is 2 rad from where its commands rest" in reasons[0]
+    robot = bridge["UniversalRobot"](control, receive, camera)
+    session = play(policy, robot, 6.0, Waiting(), asked_for, {})
+    assert not sent and not session.episodes
+    assert "Joint2 is 2 rad from where its commands rest" in session.reason
 
 
 # Of Universal Robots' own table (support article "DH parameters"): d and a of each joint, m.
@@ -299,13 +339,17 @@ def test_a_ur_bridge_sends_nothing_to_another_robot(robot, parked) -> None:
         getActualTCPPose=lambda: tool_pose(robot, arm.angles),
     )
     camera = message(measure=lambda: {"ball_age": np.inf}, receive=lambda: None)
-    reasons = bridge["bounce"](policy, control, receive, camera, {}, 6.0, {}, lambda: False)
+    driver = bridge["UniversalRobot"](control, receive, camera)
+    operator = Waiting()
+    session = play(policy, driver, 6.0, operator, asked_for, {})
     if robot == "UR5e":
-        assert not reasons and sent
+        assert sent and session.fault is None
         np.testing.assert_allclose(sent[0], start, atol=1e-3)
+        # Without a picture of the ball, no word starts an episode.
+        assert not session.episodes and "there is no picture of the ball" in session.reason
     else:
-        assert not sent
-        assert len(reasons) == 1 and "check that the policy is of this arm" in reasons[0]
+        assert not sent and session.fault == "joint_astray"
+        assert "check that the policy is of this arm" in session.reason
 
 
 def test_a_robots_program_asks_for_a_box(capsys: pytest.CaptureFixture) -> None:
@@ -323,8 +367,14 @@ def message(**fields: Any) -> types.SimpleNamespace:
     return types.SimpleNamespace(**fields)
 
 
-def ros_bridge(monkeypatch: pytest.MonkeyPatch, world: World, said: list[str]) -> dict[str, Any]:
-    """The names of the ROS bridge, on stand-ins of the messages and of a node."""
+def ros_bridge(
+    monkeypatch: pytest.MonkeyPatch, world: World, said: list[str], turn: Callable[[Any], None]
+) -> dict[str, Any]:
+    """The names of the ROS bridge, on stand-ins of the messages, of a node and of an executor.
+
+    Args:
+      turn: takes a node through a period, in which messages come and then the timer.
+    """
 
     class Time:
         def __init__(self, nanoseconds: int):
@@ -349,16 +399,24 @@ def ros_bridge(monkeypatch: pytest.MonkeyPatch, world: World, said: list[str]) -
             return message(publish=lambda sent: setattr(self, "sent", sent.data))
 
         def create_timer(self, period: float, callback) -> None:
-            self.timers.append((period, callback))
-
-        def get_clock(self) -> types.SimpleNamespace:
-            return message(now=lambda: Time(round(world.time * 1e9)))
+            assert period == 1.0 / RATE
+            self.timers.append(callback)
 
         def get_logger(self) -> types.SimpleNamespace:
             return message(info=said.append)
 
+    class Executor:
+        def add_node(self, node: Node) -> None:
+            self.node = node
+
+        def spin_once(self) -> None:
+            turn(self.node)
+            (tick,) = self.node.timers
+            tick()
+
     modules = {
         "rclpy": {},
+        "rclpy.executors": {"SingleThreadedExecutor": Executor},
         "rclpy.node": {"Node": Node},
         "rclpy.time": {"Time": Time},
         "geometry_msgs.msg": {"PointStamped": None, "PoseStamped": None},
@@ -376,63 +434,67 @@ def ros_bridge(monkeypatch: pytest.MonkeyPatch, world: World, said: list[str]) -
 
 
 def test_ros2_bridge(monkeypatch: pytest.MonkeyPatch) -> None:
-    world, said = World(), []
-    bridge = ros_bridge(monkeypatch, world, said)
-    rests_at = world.data.ctrl[:6].tolist()
+    world, watched, operator, said = World(), Watched(), Waiting(), []
     tool_topic = "/tcp_pose_broadcaster/pose"
-    node = bridge["Bridge"](load_policy("robust"), rests_at, {"box": BOX}, "base", tool_topic, 0.5)
+    backwards = world.names[::-1]
+    shown: list[float] = []
+    missing: set[str] = set()
+
+    def turn(node: Any) -> None:
+        """A period, of which the last command is sent; the first ten have no tool's pose."""
+        if watched.supervisor is not None:
+            knocked(world)
+            world.tick(getattr(node, "sent", world.data.ctrl))
+            world.watch(watched.supervisor)
+        if world.ticks < 10:
+            # Nothing is sent before the tool's pose has come.
+            assert not hasattr(node, "sent")
+        else:
+            node.subscribed[tool_topic](tool_message(world))
+        velocities = world.data.qvel[:6][::-1].tolist()
+        state = message(
+            header=message(stamp=stamp_of(world.time)),
+            name=backwards,
+            position=world.data.qpos[:6][::-1].tolist(),
+            velocity=[] if "velocities" in missing else velocities,
+        )
+        if "angles" not in missing:
+            node.subscribed["/joint_states"](state)
+        gripper = message(name=["finger"], position=[0.02], velocity=[])
+        node.subscribed["/joint_states"](gripper)
+        picture = world.picture()
+        if picture is not None and picture[0] not in shown[-1:]:
+            shown.append(picture[0])
+            point = message(**dict(zip("xyz", picture[1], strict=True)))
+            header = message(stamp=stamp_of(picture[0]), frame_id="base")
+            node.subscribed["/ball"](message(point=point, header=header))
+        if operator.has_word(watched.supervisor.state):
+            node.subscribed["/start"](message())
+
+    bridge = ros_bridge(monkeypatch, world, said, turn)
     # The operator says where the arm rests, where the paddle may go, and the frame's name.
     rests, box, frame = ["--rests-at", "0", "0"], ["--no-box"], ["--frame", "base"]
     for words in (rests + box, rests + frame, box + frame):
         with pytest.raises(SystemExit):
             bridge["parse_arguments"](["robust", *words])
     assert bridge["parse_arguments"](["robust", *rests, *box, *frame]).frame == "base"
-    ((period, tick),) = node.timers
-    assert period == 1.0 / RATE
-    backwards = world.names[::-1]
-    shown = None
-    for count in range(round(SECONDS * RATE)):
-        if count == 10:
-            # Nothing is sent before the tool's pose has come.
-            assert not hasattr(node, "sent")
-        if count >= 10:
-            node.subscribed[tool_topic](tool_message(world))
-        state = message(
-            header=message(stamp=stamp_of(world.time)),
-            name=backwards,
-            position=world.data.qpos[:6][::-1].tolist(),
-            velocity=world.data.qvel[:6][::-1].tolist(),
-        )
-        node.subscribed["/joint_states"](state)
-        gripper = message(name=["finger"], position=[0.02], velocity=[])
-        node.subscribed["/joint_states"](gripper)
-        picture = world.picture()
-        if picture is not None and picture[0] != shown:
-            shown = picture[0]
-            point = message(**dict(zip("xyz", picture[1], strict=True)))
-            header = message(stamp=stamp_of(shown), frame_id="base")
-            node.subscribed["/ball"](message(point=point, header=header))
-        if node.arm.state in ("ready", "stopped"):
-            node.subscribed["/start"](message())
-        tick()
-        knocked(world)
-        world.tick(getattr(node, "sent", world.data.ctrl))
-        world.watch(node.arm)
-    said = [words for words in said if words.startswith("stopped")]
-    assert len(said) == 1
-    check(world, [said[0].removeprefix("stopped as ").removesuffix("; going home")])
-    # A message without velocities brakes the arm.
-    assert node.arm.state == "running"
-    node.subscribed["/joint_states"](message(**vars(state) | {"velocity": []}))
-    for _ in range(RATE // 10):
-        tick()
-    assert node.arm.state == "stopped" and "joint_velocities" in node.arm.reason
+    rests_at = world.data.ctrl[:6].tolist()
+    node = bridge["Bridge"](world.names, rests_at, "base", tool_topic)
+    session = play(watched.policy, node, SECONDS, node, asked_for, {"box": BOX})
+    check(world, session)
+    assert [words.split(";")[0] for words in said][::2] == ["the arm is ready"] * 2
+    assert len(said) == 3 and "give the word to go home, with no hand near" in said[1]
+    # A message without velocities brakes the arm, and the program ends.
+    missing.add("velocities")
+    node.rests_at = np.array(node.sent)
+    session = play(watched.policy, node, SECONDS, node, asked_for, {"box": BOX})
+    assert session.fault == "measurement" and "joint_velocities" in session.reason
     # Angles that come no more are no new ones.
-    node.subscribed["/start"](message())
-    assert node.arm.state == "homing"
-    for _ in range(RATE // 10):
-        tick()
-    assert (node.arm.state, node.arm.fault) == ("stopped", "time")
+    missing.add("angles")
+    operator.asked.clear()
+    node.rests_at = np.array(node.sent)
+    session = play(watched.policy, node, SECONDS, node, asked_for, {"box": BOX})
+    assert session.fault == "time"
 
 
 def stamp_of(time: float) -> types.SimpleNamespace:
@@ -451,60 +513,88 @@ def tool_message(world: World, frame: str = "base") -> types.SimpleNamespace:
     return message(pose=pose, header=message(frame_id=frame))
 
 
-def test_a_ros2_bridge_takes_no_message_of_another_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+def resting(world: World, turn: Callable[[Any, int], None]) -> Callable[[Any], None]:
+    """Periods of an arm that rests at its start pose, each with its messages and others'."""
+    angles = list(load_policy("robust").metadata.default_joint_angles)
+    count = itertools.count()
+
+    def period(node: Any) -> None:
+        number = next(count)
+        header = message(stamp=stamp_of(1.0 + number / RATE), frame_id="base")
+        still = {"position": angles, "velocity": [0.0] * 6}
+        node.subscribed["/joint_states"](message(header=header, name=world.names, **still))
+        turn(node, number)
+
+    return period
+
+
+@pytest.mark.parametrize("topic", ["/ball", "/tool"])
+def test_a_ros2_bridge_takes_no_message_of_another_frame(
+    monkeypatch: pytest.MonkeyPatch, topic: str
+) -> None:
+    """It brakes, and the program ends with the reason."""
     world, said = World(), []
-    bridge = ros_bridge(monkeypatch, world, said)
-    rests_at = world.data.ctrl[:6].tolist()
-    point = message(x=0.5, y=0.0, z=0.5)
-    stamp = message(sec=0, nanosec=0)
-    node = bridge["Bridge"](load_policy("robust"), rests_at, {"box": BOX}, "base", "/tool")
-    node.subscribed["/ball"](message(point=point, header=message(stamp=stamp, frame_id="camera")))
+    watched = Watched()
+
+    def turn(node: Any, number: int) -> None:
+        wrong = number == 60
+        if topic == "/tool":
+            tool = tool_message(world, "base_link" if wrong else "base")
+            node.subscribed["/tool"](tool)
+        elif wrong:
+            header = message(stamp=stamp_of(1.0), frame_id="base_link")
+            point = message(x=0.5, y=0.0, z=0.5)
+            node.subscribed["/ball"](message(point=point, header=header))
+
+    bridge = ros_bridge(monkeypatch, world, said, resting(world, turn))
+    world.data.qpos[:6] -= 0.05
+    angles = list(watched.policy.metadata.default_joint_angles)
+    tool_topic = "/tool" if topic == "/tool" else None
+    node = bridge["Bridge"](world.names, angles, "base", tool_topic)
+    session = play(watched.policy, node, 1.0, node, asked_for, {"box": BOX})
+    assert session.fault == "stopped" and hasattr(node, "sent")
+    assert "has the frame_id 'base_link', not 'base'; transform it" in session.reason
     assert "ball_position" not in node.measurements
-    assert node.arm.state != "ready" and "'camera', not 'base'" in node.arm.reason
-    node = bridge["Bridge"](load_policy("robust"), rests_at, {"box": BOX}, "base", "/tool")
-    node.subscribed["/tool"](tool_message(world, "base_link"))
-    assert "tool_position" not in node.measurements
-    assert "the tool's pose has the frame_id 'base_link'" in node.arm.reason
 
 
 def test_a_ros2_bridge_sends_nothing_to_an_arm_with_another_tool(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    world, said = World(), []
-    bridge = ros_bridge(monkeypatch, world, said)
-    rests_at = world.data.ctrl[:6].tolist()
+    world = World()
+    world.data.qpos[:6] -= 0.05
+    angles = list(load_policy("robust").metadata.default_joint_angles)
     for off in (0.0, 0.1):
-        node = bridge["Bridge"](load_policy("robust"), rests_at, {"box": BOX}, "base", "/tool")
-        header = message(stamp=stamp_of(0.0))
-        state = message(header=header, name=world.names, position=rests_at, velocity=[0.0] * 6)
-        tool = tool_message(world)
-        tool.pose.position.x += off
-        node.subscribed["/joint_states"](state)
-        node.subscribed["/tool"](tool)
-        ((_, tick),) = node.timers
-        tick()
+
+        def turn(node: Any, number: int, off: float = off) -> None:
+            tool = tool_message(world)
+            tool.pose.position.x += off
+            node.subscribed["/tool"](tool)
+
+        bridge = ros_bridge(monkeypatch, world, [], resting(world, turn))
+        node = bridge["Bridge"](world.names, angles, "base", "/tool")
+        session = play(load_policy("robust"), node, 0.1, node, asked_for, {"box": BOX})
         assert hasattr(node, "sent") == (off == 0.0)
-    assert "check that the policy is of this arm" in node.arm.reason
+    assert "check that the policy is of this arm" in session.reason
 
 
 def test_a_start_that_is_refused_is_said_and_waited_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As of a ball that is not over the paddle, or of none."""
+    """As of a ball that is not over the paddle, or of none, or of an old picture."""
     world, said = World(), []
-    bridge = ros_bridge(monkeypatch, world, said)
-    rests_at = load_policy("robust").metadata.default_joint_angles
-    node = bridge["Bridge"](load_policy("robust"), list(rests_at), {"box": BOX}, "base")
-    ((_, tick),) = node.timers
-    for count in range(100):
-        header = message(stamp=stamp_of(1.0 + 0.002 * count), frame_id="base")
-        still = {"position": list(rests_at), "velocity": [0.0] * 6}
-        node.subscribed["/joint_states"](message(header=header, name=world.names, **still))
-        if count == 90:
-            node.subscribed["/start"](message())
-        if count > 90:
+
+    def turn(node: Any, number: int) -> None:
+        if number >= 100:
+            age = 0.2 if number < 150 else 0.0
+            header = message(stamp=stamp_of(1.0 + number / RATE - age), frame_id="base")
             point = message(x=0.6, y=0.6, z=0.4)
             node.subscribed["/ball"](message(point=point, header=header))
-        tick()
-    assert node.arm.state == "ready"
-    node.subscribed["/start"](message())
-    assert node.arm.state == "ready"
-    assert "no picture of the ball" in said[0] and "0.6 m beside" in said[1]
+        if number in (90, 140, 190):
+            node.subscribed["/start"](message())
+
+    bridge = ros_bridge(monkeypatch, world, said, resting(world, turn))
+    angles = list(load_policy("robust").metadata.default_joint_angles)
+    node = bridge["Bridge"](world.names, angles, "base")
+    session = play(load_policy("robust"), node, 0.5, node, asked_for, {"box": BOX})
+    assert session.fault is None and not session.episodes
+    assert len(said) == 4
+    assert "no picture of the ball" in said[1] and "200 ms old" in said[2]
+    assert "0.6 m beside" in said[3] and "0.6 m beside" in session.reason

@@ -684,6 +684,37 @@ def test_a_ball_that_a_hand_holds_stops_the_arm(
         assert "nobody holds it" in arm.reason
 
 
+@pytest.mark.parametrize("rate", [100.0, 60.0, 30.0])
+def test_low_bounces_in_a_row_are_no_hand(rate: float) -> None:
+    """Of 7 cm, in which the ball is always near the paddle: no line is as bent."""
+    arm, home, seen = supervised("robust")
+    paddle = paddle_position(load_policy("robust").metadata, home)
+    rng = np.random.default_rng(0)
+    step, angles = 0, home
+    while arm.state != "ready" and step < 500:
+        given = seen(angles, step)
+        given["ball_position"] = paddle + [0.0, 0.0, 0.4]
+        angles = arm.commands(given)[-1]
+        step += 1
+    arm.start()
+    began, flight = step, 0.24
+    shown = None
+    for step in range(began, began + 80):
+        given = seen(angles, step)
+        time = 0.01 * step
+        picture = math.floor((time - 0.03) * rate)
+        if picture != shown:
+            shown = picture
+            flown = max(picture / rate - 0.01 * began, 0.0) % flight
+            height = 0.0225 + 0.5 * 9.81 * flown * (flight - flown)
+            ball = paddle + [0.0, 0.0, height] + rng.normal(0.0, 0.003, 3)
+        given |= {"ball_position": ball, "ball_age": time - picture / rate}
+        if "ball_velocity" in given:
+            given["ball_velocity"] = np.zeros(3)
+        angles = arm.commands(given)[-1]
+        assert arm.fault is None, arm.reason
+
+
 def test_a_ball_that_flies_is_not_lost_wherever_it_is() -> None:
     """From a noisy camera, as when it is thrown at the arm; at one place, somebody holds it."""
     for speed, fault in ((-1.5, None), (0.0, "ball_flight")):

@@ -23,6 +23,7 @@ from bounce_mjx.identify.reading import read_log
 from bounce_mjx.rehearsal.arm import SimulatedArm, goals_in_turn, middle, rate_of
 from bounce_mjx.rehearsal.camera import NoCamera
 from bounce_mjx.rehearsal.faults import KINDS, Injection, named_fault
+from bounce_mjx.rehearsal.operator import SimulatedOperator
 from bounce_mjx.world.model import world_model
 
 JOINTS = tuple(f"Joint{i}" for i in range(1, 7))
@@ -37,7 +38,7 @@ def rehearsed(name: str, fault: str | None = None, seconds: float = 4.0, **world
     if fault is not None:
         injection = Injection(named_fault(fault, policy.metadata.joint_names)[0], after=1.5)
     arm = SimulatedArm(config, middle(config) | world, injection=injection)
-    session = play(policy, arm, seconds, arm.is_told, goals_in_turn(config, {}), {})
+    session = play(policy, arm, seconds, SimulatedOperator(arm), goals_in_turn(config, {}), {})
     return session, arm
 
 
@@ -178,7 +179,7 @@ def test_only_the_robust_policy_bounces_with_a_late_camera() -> None:
         world = {"camera_rate": 120.0, "ball_position_noise": 0.002, "ball_latency": 0.02}
         arm = SimulatedArm(config, world)
         goals = goals_in_turn(config, {"target_height": (0.5,)})
-        session = play(load_policy(name), arm, 8.0, arm.is_told, goals, {})
+        session = play(load_policy(name), arm, 8.0, SimulatedOperator(arm), goals, {})
         episode = session.episodes[0]
         outcomes[name] = episode.fault, arm.bounces_in(episode.start, episode.seconds)
     assert outcomes["robust"][0] is None and outcomes["robust"][1] >= 10

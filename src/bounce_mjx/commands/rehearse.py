@@ -88,6 +88,7 @@ def _rehearse_policy(command: RehearseCommand, given_goals: GivenGoals) -> None:
     from bounce_mjx.deploy.motion import paddle_position
     from bounce_mjx.deploy.session import play
     from bounce_mjx.rehearsal.arm import goals_in_turn
+    from bounce_mjx.rehearsal.operator import SimulatedOperator
 
     policy = load_policy(_policy_file(command))
     config = _config_of_policy(command)
@@ -100,9 +101,9 @@ def _rehearse_policy(command: RehearseCommand, given_goals: GivenGoals) -> None:
     print(f"box: --box {' '.join(f'{end:.2f}' for end in box.ravel())}")
     units = {name: wanted.unit for name, wanted in metadata.goals.items()}
     with _log(command, metadata.joint_names, units, metadata.num_balls) as recorder:
-        session = play(
-            policy, arm, command.seconds, arm.is_told, goals, {"box": tuple(box)}, recorder
-        )
+        settings = {"box": tuple(box)}
+        operator = SimulatedOperator(arm)
+        session = play(policy, arm, command.seconds, operator, goals, settings, recorder)
     _tell(command, session, arm)
     _film(command, config, arm, goals)
     _exit_with_status(command, session)

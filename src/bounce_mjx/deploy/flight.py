@@ -1,5 +1,6 @@
 """Whether a ball falls: away from the paddle, its last pictures lie on a parabola of gravity's
-curvature; near it, the ball leaves again unless the task lets it rest.
+curvature; near it, where it bounces, they do not lie on a straight line, as those of a ball that a
+hand holds or carries do, unless the task lets the ball rest.
 
 In free flight a ball's places are x0 + v t + g t^2 / 2. What is left of them after the least
 squares in x0 and v is judged in three directions: the largest of single pictures; the part along
@@ -37,8 +38,23 @@ _IMPACT_SPEED = 5.0
 _TOUCH = 0.07
 # Horizontal distance from the paddle's centre at which it may touch, m.
 _REACH = 0.15
-# Time in which a ball near the paddle leaves it, s.
-_LEAVING = 0.4
+# Time in which a ball near the paddle leaves the straight line on which a hand would carry it, and
+# the time in which it is seen to fall, s.
+_HELD = 0.4
+_LEAVING = 1.0
+# How far the root mean square of noise may be above its standard deviation, in deviations of it.
+_ABOVE = 3.5
+
+
+class Near(NamedTuple):
+    """A ball near the paddle that was not seen to fall since."""
+
+    since: float
+    """The time of its first picture, s."""
+    times: np.ndarray
+    """Of the pictures in the last 0.4 s [N], s."""
+    heights: np.ndarray
+    """Of the ball in them [N], m."""
 
 
 class Flight(NamedTuple):
@@ -52,9 +68,8 @@ class Flight(NamedTuple):
     """Of the last one above the paddle, m."""
     is_over: bool
     """Whether the last one was over the paddle."""
-    near_since: float | None
-    """Time from which the ball was near the paddle and was not seen to fall, s; None of one that
-    was."""
+    near: Near | None
+    """None of a ball that was seen to fall since it was near the paddle."""
 
 
 class FlightBounds(NamedTuple):
@@ -195,16 +210,45 @@ def follow(
         seconds = times[-1] - times[0]
         return flight, f"has not fallen as a ball does for {1e3 * seconds:.0f} ms"
     # A ball at which the paddle swings comes and goes, and has left when it is seen to fall.
-    near_since = None if fit.is_known else flight.near_since
-    return Flight(times, places, height, is_over, near_since), None
+    near = None if fit.is_known or flight.near is None else _still_near(flight.near, time, place)
+    return Flight(times, places, height, is_over, near), None
 
 
 def _touching(
     bounds: FlightBounds, flight: Flight, time: float, place: np.ndarray, height: float
 ) -> tuple[Flight, str | None]:
     """A picture before which the ball may have touched the paddle: a new flight begins."""
-    near_since = float(flight.times[-1]) if flight.near_since is None else flight.near_since
-    if not bounds.may_rest and time - near_since > _LEAVING:
-        seconds = time - near_since
-        return flight, f"has been near the paddle for {seconds:.2g} s, where it bounces off"
-    return Flight(np.array([time]), place[None], height, True, near_since), None
+    near = flight.near
+    if near is None:
+        near = Near(float(flight.times[-1]), flight.times[-1:], flight.places[-1:, 2])
+    near = _still_near(near, time, place)
+    if not bounds.may_rest:
+        seconds = time - near.since
+        if seconds > _HELD and _is_straight(near, bounds.noise):
+            reason = f"has been near the paddle for {seconds:.2g} s as if it were held there"
+            return flight, reason
+        if seconds > _LEAVING:
+            reason = f"has been near the paddle for {seconds:.2g} s, where it bounces off"
+            return flight, reason
+    return Flight(np.array([time]), place[None], height, True, near), None
+
+
+def _still_near(near: Near, time: float, place: np.ndarray) -> Near:
+    """With one more picture."""
+    kept = near.times > time - _HELD
+    times = np.append(near.times[kept], time)
+    heights = np.append(near.heights[kept], place[2])
+    return Near(near.since, times, heights)
+
+
+def _is_straight(near: Near, noise: float) -> bool:
+    """Whether the heights are those of a constant velocity, but for a noise (m)."""
+    count = len(near.times)
+    if count < 3:
+        return True
+    t = near.times - near.times.mean()
+    left = near.heights - near.heights.mean()
+    left -= t * ((t @ left) / (t @ t))
+    # The root mean square of n values of deviation 1 has a deviation of 1 / sqrt(2 n).
+    bound = 1.0 + _ABOVE / math.sqrt(2.0 * (count - 2))
+    return math.sqrt((left @ left) / (count - 2)) < bound * noise

@@ -1,22 +1,27 @@
 """The program around a policy, or a motion, and an arm. The same code drives a simulated arm and a
-real one: only the `Arm` differs."""
+real one: only the `Arm` and the `Operator` differ."""
 
+import select
+import sys
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from bounce_mjx.deploy.faults import picture_age
 from bounce_mjx.deploy.policy import DeployedPolicy
 from bounce_mjx.deploy.recorder import Recorder
-from bounce_mjx.deploy.supervisor import Supervisor
+from bounce_mjx.deploy.supervisor import State, Supervisor
 from bounce_mjx.deploy.trajectory import Trajectory
 from bounce_mjx.errors import UserError
 
 BALL_GONE = ("ball_lost", "ball_flight")
 """Faults after which the operator may start another episode."""
-SETTLING = 0.5
-"""Time that a stopped arm has to come to rest before it goes home again, s."""
+_OVER = "the time is over"
+_WAITING: dict[str, str] = {
+    "ready": "the arm is ready; give the word to start",
+    "stopped": "stopped as {reason}; give the word to go home, with no hand near",
+}
+"""What the operator hears of an arm that waits for the word, by its state."""
 # A motion begins where the arm is, and stops where a joint is too far from its target, rad.
 _AT_START = 0.05
 _TOO_FAR = 0.2
@@ -37,7 +42,12 @@ class Arm(Protocol):
         know them."""
 
     def measure(self) -> dict[str, Any]:
-        """The newest measurements by name, as `DeployedPolicy.step` takes them, with `time`."""
+        """The newest measurements by name, as `DeployedPolicy.step` takes them, with `time`.
+
+        Raises:
+          UserError: what came is not of this arm, such as a message of another frame; the arm
+            brakes, and the program ends. Any other exception ends it at once.
+        """
 
     def send(self, commands: np.ndarray) -> None:
         """Sends commands [M, J] (rad), one in each period, and returns after M periods; of [0, J],
@@ -47,8 +57,33 @@ class Arm(Protocol):
         """Ends the sending, so that the arm does not go on toward its last command."""
 
 
+class Operator(Protocol):
+    """Who stands by the arm, and sees that no hand is near when it moves."""
+
+    def has_word(self, state: State) -> bool:
+        """Whether they have given the word since the last call: to start where the arm is `ready`,
+        to go home where it is `stopped`. Asked once a control step, in every state; a word that
+        comes in another one does not count."""
+
+    def hear(self, words: str) -> None:
+        """Tells them what the arm waits for."""
+
+
+class Terminal:
+    """An operator at the program's terminal, whose word is the key Enter."""
+
+    def has_word(self, state: State) -> bool:
+        """As `Operator.has_word`."""
+        has_line, _, _ = select.select([sys.stdin], [], [], 0.0)
+        return bool(has_line and sys.stdin.readline())
+
+    def hear(self, words: str) -> None:
+        """As `Operator.hear`."""
+        print(words, flush=True)
+
+
 class Episode(NamedTuple):
-    """From the operator's word to a stop, or to the end of the time."""
+    """From the operator's word to the begin of the braking, or to the end of the time."""
 
     start: float
     """Time of the driver's clock, s."""
@@ -69,50 +104,23 @@ class Session(NamedTuple):
     """Why it ended, or what it still waited for."""
 
 
-def heed_word(supervisor: Supervisor, ball_age: float, max_age: float) -> str | None:
-    """What the operator's word does: it starts an episode where the arm is ready, and sends it home
-    where it has stopped. Without a word, neither moves.
-
-    Args:
-      supervisor: of the arm.
-      ball_age: of the newest picture of the ball, s.
-      max_age: largest one with which an episode starts, s.
-
-    Returns:
-      Why nothing has begun, to be said; the arm rests on. None if it has.
-    """
-    if supervisor.state == "stopped":
-        supervisor.restart()
-        return None
-    if supervisor.state != "ready":
-        return f"the arm is {supervisor.state}"
-    if not ball_age <= max_age:
-        return f"no picture of the ball is newer than {max_age:g} s"
-    try:
-        supervisor.start()
-    except UserError as error:
-        # The ball is not over the paddle.
-        return str(error)
-    return None
-
-
 def play(
     policy: DeployedPolicy,
     arm: Arm,
     seconds: float,
-    is_told: Callable[[str], bool],
+    operator: Operator,
     goals: Callable[[float], Mapping[str, float]],
     box: Mapping[str, Any],
     recorder: Recorder | None = None,
 ) -> Session:
-    """Plays for a time, again on the operator's word after each lost ball, until another fault.
+    """Sends the arm home, plays for a time, and brakes. Each episode starts on the operator's word,
+    and after a lost ball another word sends the arm home; another fault ends the program.
 
     Args:
       policy: for this arm.
       arm: on which it plays.
-      seconds: by the steps of the policy.
-      is_told: whether the operator gives the word to start; asked once a control step, with the
-        supervisor's state. A word that comes before the arm is ready does not count.
+      seconds: by the periods of the commands; infinite for no end.
+      operator: who gives the word.
       goals: time since the begin (s) -> what the task asks for, such as the target height, m.
       box: the settings `box` and others of `DeployedPolicy.supervise`.
       recorder: of a log; None for none.
@@ -122,47 +130,88 @@ def play(
         fit; whatever is raised, the arm is stopped first.
     """
     # Where the controller holds the arm, which no reading of the encoders tells wrongly.
-    policy.reset(arm.targets())
-    supervisor = policy.supervise(arm.rate, **box)
-    dt = policy.metadata.control_dt
-    # An older picture would stop the arm at once.
-    max_age = picture_age(policy.metadata)
     held = arm.targets()
+    policy.reset(held)
+    supervisor = policy.supervise(arm.rate, **box)
     episodes = []
     start: float | None = None
-    stopped_at: float | None = None
-    reason = None
+    time = 0.0
+    periods = 0
+    told: State | None = None
+    reason = refusal = None
+    # A word of before, as for another session, does not count.
+    operator.has_word(supervisor.state)
     try:
-        for step in range(round(seconds / dt)):
-            measured = arm.measure() | goals(step * dt)
+        while True:
+            elapsed = periods / arm.rate
+            is_over = elapsed >= seconds
+            measured = _measured(arm, supervisor, goals(elapsed))
+            if is_over:
+                supervisor.stop(_OVER, _OVER)
             commands = supervisor.commands(measured)
             arm.send(commands)
+            periods += max(len(commands), 1)
             if len(commands):
                 held = commands[-1]
-            if recorder is not None and held is not None:
+            if recorder is not None and held is not None and "time" in measured:
                 # After the commands, which a full disk must not keep back.
                 recorder.step(measured, held)
-            has_word = is_told(supervisor.state)
-            reason = supervisor.reason
-            if supervisor.state == "ready" and has_word:
-                reason = heed_word(supervisor, measured.get("ball_age", np.inf), max_age)
-                if reason is None:
-                    start = measured["time"]
-            elif supervisor.state == "stopped" and stopped_at is None:
-                stopped_at = measured["time"]
-                if start is not None:
-                    episodes.append(Episode(start, stopped_at - start, supervisor.fault, reason))
+            time = _time_of(measured, time)
+            state = supervisor.state
+            fault = None if supervisor.fault == _OVER else supervisor.fault
+            if supervisor.fault != _OVER:
+                reason = supervisor.reason or refusal
+            if start is not None and state != "running":
+                why = None if fault is None else reason
+                episodes.append(Episode(start, time - start, fault, why))
                 start = None
-                if supervisor.fault not in BALL_GONE:
-                    return Session(tuple(episodes), supervisor.fault, reason)
-            elif supervisor.state == "stopped" and measured["time"] - stopped_at > SETTLING:
-                stopped_at = None
+            if state == "stopped" and (is_over or fault not in BALL_GONE):
+                ended_by = None if fault in BALL_GONE else fault
+                return Session(tuple(episodes), ended_by, reason)
+            if state != told and state in _WAITING:
+                operator.hear(_WAITING[state].format(reason=reason))
+            told = state
+            if not operator.has_word(state):
+                continue
+            if state == "stopped":
                 supervisor.restart()
-        if start is not None:
-            episodes.append(Episode(start, measured["time"] - start))
+            elif state == "ready":
+                refusal = _start(supervisor, measured)
+                if refusal is None:
+                    start = time
+                else:
+                    operator.hear(f"nothing starts: {refusal}")
     finally:
         arm.stop()
-    return Session(tuple(episodes), None, reason)
+
+
+def _measured(arm: Arm, supervisor: Supervisor, goals: Mapping[str, float]) -> dict[str, Any]:
+    """What the arm measures, with the goals; the arm stops where its driver refuses that."""
+    try:
+        return arm.measure() | goals
+    except UserError as error:
+        supervisor.stop(str(error))
+        return dict(goals)
+
+
+def _time_of(measured: Mapping[str, Any], last: float) -> float:
+    """The driver's time, s; the last one where it is missing or no number."""
+    try:
+        return float(np.ravel(measured["time"])[0])
+    except (KeyError, IndexError, TypeError, ValueError):
+        return last
+
+
+def _start(supervisor: Supervisor, measured: Mapping[str, Any]) -> str | None:
+    """Starts an episode of an arm that is ready; returns why it does not begin, and the arm rests
+    on, or None."""
+    if "ball_position" not in measured:
+        return "there is no picture of the ball"
+    try:
+        supervisor.start()
+    except UserError as error:
+        return str(error)
+    return None
 
 
 def replay(arm: Arm, trajectory: Trajectory, recorder: Recorder | None = None) -> None:

@@ -80,6 +80,8 @@ class Progress(NamedTuple):
     """Measured [J] in the last step at home, rad."""
     balls: np.ndarray | None = None
     """Measured [B, 3] in the last step at home, m; None without a picture."""
+    ball_age: float | None = None
+    """Of that picture, s; None where the driver gives none."""
 
 
 class Supervisor:
@@ -164,7 +166,8 @@ class Supervisor:
         """Starts an episode, at the moment in which the ball is let go.
 
         Raises:
-          UserError: the arm is not ready, or the ball is seen elsewhere than over the paddle.
+          UserError: the arm is not ready, or the ball is seen elsewhere than over the paddle, or in
+            a picture that would stop the arm at once.
         """
         if self.state != "ready":
             raise UserError(
@@ -286,7 +289,7 @@ class Supervisor:
         progress = self._timed(progress, measured, host)
         balls = self._given(measurements, "ball_position")
         places = None if balls is None else balls.reshape(-1, 3)
-        progress = progress._replace(balls=places)
+        progress = progress._replace(balls=places, ball_age=self._age_given(measurements))
         if not progress.has_found_arm:
             return self._find_arm(progress, measured, waited)
         return self._go_home(progress, measured, waited)
@@ -530,6 +533,13 @@ class Supervisor:
         except (UserError, KeyError, TypeError):
             return None
 
+    def _age_given(self, measurements: Mapping[str, Any]) -> float | None:
+        """Age of the balls' picture, s; infinite if it cannot be read, None if there is none."""
+        if "ball_age" not in measurements:
+            return None
+        given = self._given(measurements, "ball_age")
+        return math.inf if given is None else float(given[0])
+
     def _is_not_moved(self, progress: Progress, measurements: Mapping[str, Any]) -> bool:
         """Whether a stopped arm is where its commands rest, has had no time to settle, or is not
         measured."""
@@ -543,7 +553,14 @@ class Supervisor:
         return bool(np.all(np.abs(angles - place) <= self._watch.offset))
 
     def _check_start(self, progress: Progress) -> None:
-        """Raises UserError for a ball that is not over the paddle by forward kinematics."""
+        """Raises UserError for an old picture of the ball, or a ball that is not over the paddle by
+        forward kinematics."""
+        age = progress.ball_age
+        if age is not None and age > self._max_picture_age:
+            raise UserError(
+                f"the newest picture of the ball is {1e3 * age:.0f} ms old, and an episode starts "
+                f"with one of at most {1e3 * self._max_picture_age:.0f} ms; check the camera"
+            )
         if progress.balls is None or self._metadata.ball_thrown is not False:
             return
         paddle = paddle_position(self._metadata, progress.resting_angles)

@@ -91,7 +91,7 @@ class Moved(NamedTuple):
 
 class SimulatedArm:
     """An arm with a paddle, its balls, its encoders and a camera. Somebody holds the balls at their
-    start until an episode starts (`is_told`)."""
+    start (`is_held`) until they let go."""
 
     def __init__(
         self,
@@ -257,15 +257,6 @@ class SimulatedArm:
     def stop(self) -> None:
         """As `Arm.stop`; nothing is sent by itself."""
 
-    def is_told(self, state: str) -> bool:
-        """The word of somebody who holds the balls until the arm is ready, and lets go as they give
-        it, again after each stop."""
-        was_held = self.is_held
-        self.is_held = state not in ("running", "braking")
-        if was_held and not self.is_held:
-            self._release()
-        return state == "ready"
-
     def bounces_in(self, start: float, seconds: float) -> int:
         """Number of bounces from a time on (s), for a time (s)."""
         return sum(start <= time <= start + seconds for time in self.bounces)
@@ -298,8 +289,9 @@ class SimulatedArm:
         self._places = places + noise + self.world.get("ball_start", 0.0)
         self._velocities = velocities
 
-    def _release(self) -> None:
+    def let_go(self) -> None:
         """Lets the balls go, as the task throws them."""
+        self.is_held = False
         for ball, velocity in zip(self.balls, self._velocities, strict=True):
             self.data.qvel[list(ball.qvel[:3])] = velocity
         if self.started is None:
