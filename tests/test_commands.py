@@ -21,7 +21,7 @@ from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.folders import choose_checkpoint
 from bounce_mjx.runs.layers import read_preset
-from bounce_mjx.runs.start import Choice, find_start
+from bounce_mjx.runs.start import StartFlags, find_start
 from bounce_mjx.viewers.simulation import Simulation
 from tiny_runs import STEPS, TINY, TRAIN_SCRIPT, shared_run
 
@@ -261,7 +261,7 @@ def test_the_help_of_a_training_is_one_screen_and_the_whole_help_has_every_flag(
     assert "--num-envs INT          Environments that run in parallel (default: 512)" in pages[0]
     shown = {*re.findall(r"^  (--[\w.-]+)", pages[1], re.MULTILINE)}
     shown |= {*re.findall(r"^  --.+, (--no-[\w.-]+)", pages[1], re.MULTILINE)}
-    known = {*flags_of(fields_of_command(find_start(Choice())))}
+    known = {*flags_of(fields_of_command(find_start(None, StartFlags())))}
     assert shown == known
     assert pages[1].index("\nppo:\n") < pages[1].index("--learning-rate FLOAT")
 

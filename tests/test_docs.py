@@ -35,7 +35,7 @@ from bounce_mjx.errors import MissingPackage
 from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.layers import read_layers, read_preset
-from bounce_mjx.runs.start import Choice, find_start
+from bounce_mjx.runs.start import Choice, StartFlags, find_start
 from bounce_mjx.task import registry, term_names, weighted_terms
 from bounce_mjx.task.bounce import Bounce
 from bounce_mjx.task.bounce_rewards import RewardInputs, Rewards
@@ -182,7 +182,7 @@ def known_flags() -> set[str]:
     """The flags of every command of the package, and of the maintainers' one."""
     ship = runpy.run_path(str(CHECKOUT / "benchmarks/ship.py"))
     flags = {"--help", "--help-all", "--import", *cli.flags_of(fields_in(ship["ShipCommand"]))}
-    flags |= set(cli.flags_of(fields_of_command(find_start(Choice()))))
+    flags |= set(cli.flags_of(fields_of_command(find_start(None, StartFlags()))))
     for info in pkgutil.iter_modules(commands_package.__path__):
         module = importlib.import_module(f"bounce_mjx.commands.{info.name}")
         for name, member in vars(module).items():

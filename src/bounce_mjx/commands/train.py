@@ -119,15 +119,14 @@ def read_command(args: Sequence[str]) -> TrainCommand:
     helps = {"-h", "--help", "--help-all"}.intersection(args)
     words = [word for word in args if word not in helps]
     word, after_word = _split_word(words)
-    flags_of_choice = parse(ChoiceFlags, after_word, prog=PROG, is_first=True)
-    choice = Choice(start=word, **dict(flags_of_choice))
-    start = find_start(choice)
+    first = parse(ChoiceFlags, after_word, prog=PROG, is_first=True)
+    start = find_start(word, first)
     fields = fields_of_command(start)
     if helps:
-        usual = layers_on(start, choice, default_preset(has_plugin())).config()
+        usual = layers_on(start, first, default_preset(has_plugin())).config()
         _print_help(fields, usual, is_short="--help-all" not in helps)
     given = read_flags(fields, words, prog=PROG, description=ABOUT, defaults={})
-    if given.get("start") != choice.start:
+    if given.get("start") != word:
         raise UserError(
             f"{given['start']} is what the training begins with; give it first: {PROG} "
             f"{given['start']} ..."

@@ -41,7 +41,7 @@ from bounce_mjx.runs.config import (
     TrainConfig,
 )
 from bounce_mjx.runs.presets import BASE, SOURCES, preset_files, read_config_file, shown_file
-from bounce_mjx.runs.start import Choice, Start, find_start
+from bounce_mjx.runs.start import Choice, FileFlags, Start, check_not_given, find_start
 from bounce_mjx.runs.worlds import layers_of_environment
 from bounce_mjx.world.named import without_idle_curriculum
 
@@ -65,16 +65,16 @@ def read_layers(
     Raises:
       UserError: as `find_start` and `layers_on`.
     """
-    return layers_on(find_start(choice, whole_config), choice, machine, whole_config)
+    return layers_on(find_start(choice.start, choice, whole_config), choice, machine, whole_config)
 
 
 def layers_on(
     start: Start,
-    choice: Choice,
+    files: FileFlags,
     machine: Path | None = None,
     whole_config: TrainConfig | None = None,
 ) -> "Layers":
-    """The layers on the start of a choice, without what the user says.
+    """The layers on a start, without what the user says.
 
     Args:
       machine: the machine's preset; None asks JAX, which starts its devices.
@@ -84,27 +84,30 @@ def layers_on(
       UserError: a file is missing, wrong, or of another start.
     """
     if start.resumed is not None:
+        config = files.config or whole_config
+        given = {"config": config, "robot": files.robot, "world": files.world}
+        check_not_given(start.run, given)
         return Layers(start, (Layer(f"the run {start.run}", start.resumed.model_dump()),))
     machines: list[Layer] = []
     named: list[Layer] = []
     if whole_config is not None:
-        files = [Layer("config", whole_config.model_dump(), whole=("env", "ppo"))]
+        own = [Layer("config", whole_config.model_dump(), whole=("env", "ppo"))]
     else:
-        found = preset_files(choice.config, start.task_name, machine)
+        found = preset_files(files.config, start.task_name, machine)
         machines = _layers_of_files([found.machine])
         named = _layers_of_files([found.named])
-        files = _layers_of_files(found.own)
-        for layer in (*named, *files):
+        own = _layers_of_files(found.own)
+        for layer in (*named, *own):
             _check_start(layer, start)
     changed = _changed_defaults(start.algorithm_config)
     trained = None if start.policy is None else start.policy.env
-    of_env = layers_of_environment(start.task, trained, choice.robot, choice.world)
+    of_env = layers_of_environment(start.task, trained, files.robot, files.world)
     for layer in of_env.robot:
         _check_start(layer, start)
     policies = [_with_networks(layer, start) for layer in of_env.policy]
     return Layers(
         start=start,
-        below=(*machines, *changed, *named, *policies, *files, *of_env.robot, *of_env.world),
+        below=(*machines, *changed, *named, *policies, *own, *of_env.robot, *of_env.world),
         notes=(*start.notes, *_notes(changed, named, "ppo."), *_notes(named, policies, "env.")),
     )
 

@@ -1,6 +1,7 @@
 """What a training begins with: one word fixes the classes of its settings."""
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -25,9 +26,18 @@ from bounce_mjx.task.registry import DEFAULT, find_task, is_task, registered_tas
 from bounce_mjx.task.task import Task
 
 
-class ChoiceFlags(StrictModel):
-    """The flags that decide which layers there are. The last three are keys of the config, too: the
-    algorithm's class, the policy of a warm start, and where latest is looked for."""
+class StartFlags(StrictModel):
+    """The flags that decide, with the first word, what a training begins with. They are keys of the
+    config, too: the algorithm's class, the policy of a warm start, and where latest is looked
+    for."""
+
+    algorithm: str | None = None
+    warm_start: Path | None = None
+    log_dir: Path | None = None
+
+
+class FileFlags(StrictModel):
+    """The files whose values lie on the start."""
 
     config: Annotated[tuple[Path, ...], Flag(metavar="NAME|FILE", is_repeated=True)] = ()
     """Preset, such as cpu or finetune (a YAML file in configs/), or a YAML file of yours. A task's
@@ -40,14 +50,14 @@ class ChoiceFlags(StrictModel):
     world: Annotated[Path | None, Flag(metavar="NAME|FILE")] = None
     """Named world in place of the preset's: a YAML file, or the name of one in configs/worlds/
     (ur5e_rtde, panda_fci, iiwa_fri or fast_servo). It may have a robot."""
-    algorithm: str | None = None
-    warm_start: Path | None = None
-    log_dir: Path | None = None
+
+
+class ChoiceFlags(StartFlags, FileFlags):
+    """The flags that decide which layers there are."""
 
 
 class Choice(ChoiceFlags):
-    """What decides which layers there are: the word and the flags of the command, or arguments of
-    `train`."""
+    """The first word and those flags: all that decides which layers there are."""
 
     start: Annotated[
         str | None,
@@ -88,19 +98,21 @@ class Start(NamedTuple):
         return fields_of(self.task.Config, self.algorithm_config)
 
 
-def find_start(choice: Choice, whole_config: TrainConfig | None = None) -> Start:
-    """What a word means: a task, a policy or a run; and what is said beside it.
+def find_start(
+    word: str | None, flags: StartFlags, whole_config: TrainConfig | None = None
+) -> Start:
+    """What the first word means: a task, a policy or a run; and what is said beside it.
 
     Args:
+      word: None for the default task, or that of a warm start.
       whole_config: whose task and algorithm these are, in place of a word.
 
     Raises:
       UserError: there is no such thing, or two of these exclude each other.
     """
-    word = choice.start
-    warm_start = choice.warm_start
-    algorithm = choice.algorithm
-    log_dir = choice.log_dir
+    warm_start = flags.warm_start
+    algorithm = flags.algorithm
+    log_dir = flags.log_dir
     if word is not None and not is_task(word):
         # Imports JAX, which a task's help does not need.
         from bounce_mjx.runs.folders import LATEST, is_newest
@@ -112,7 +124,7 @@ def find_start(choice: Choice, whole_config: TrainConfig | None = None) -> Start
                 )
             warm_start, word = Path(word), None
         elif is_newest(Path(word)) or os.path.isdir(word):
-            return _start_of_run(Path(word), choice, whole_config)
+            return _start_of_run(Path(word), flags)
         else:
             known = list(dict.fromkeys((*registered_tasks(), *POLICIES)))
             own = "a run's folder, or --import FILE.py for a task of your own"
@@ -154,20 +166,28 @@ def find_start(choice: Choice, whole_config: TrainConfig | None = None) -> Start
     )
 
 
-def _start_of_run(word: Path, choice: Choice, whole_config: TrainConfig | None) -> Start:
+def check_not_given(run: Path, given: Mapping[str, Any]) -> None:
+    """Checks that nothing is given of what a run has already, with which it is resumed.
+
+    Raises:
+      UserError: something is.
+    """
+    for name, value in given.items():
+        if value:
+            raise UserError(
+                f"the run {run} has its {name}, with which it is resumed; leave {name} out, or "
+                f"start a new run from its networks: --warm-start {run}"
+            )
+
+
+def _start_of_run(word: Path, flags: StartFlags) -> Start:
     """The start of a run that is resumed."""
     from bounce_mjx.runs.folders import check_newest, run_of, run_or_newest
 
-    if choice.log_dir is not None:
+    if flags.log_dir is not None:
         check_newest([word])
-    has_its_own = dict(choice) | {"config": choice.config or whole_config}
-    for name in ("config", "robot", "world", "algorithm", "warm_start"):
-        if has_its_own[name]:
-            raise UserError(
-                f"the run {word} has its {name}, with which it is resumed; leave {name} out, or "
-                f"start a new run from its networks: --warm-start {word}"
-            )
-    place = run_or_newest(word, choice.log_dir or runs_folder(find_task(DEFAULT)))
+    check_not_given(word, {"algorithm": flags.algorithm, "warm_start": flags.warm_start})
+    place = run_or_newest(word, flags.log_dir or runs_folder(find_task(DEFAULT)))
     run = run_of(place)
     config = load_run_config(run)
     classes: dict[str, type] = {"task": config.env.task}

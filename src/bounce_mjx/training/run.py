@@ -31,9 +31,9 @@ from bounce_mjx.resources import POLICIES, policy_path
 from bounce_mjx.runs import folders
 from bounce_mjx.runs.checkpoints import read_actor
 from bounce_mjx.runs.config import TrainConfig, load_run_config
-from bounce_mjx.runs.layers import FLAGS, PYTHON, Layers, read_layers
+from bounce_mjx.runs.layers import FLAGS, PYTHON, Layers, layers_on
 from bounce_mjx.runs.progress import load_results
-from bounce_mjx.runs.start import Choice
+from bounce_mjx.runs.start import FileFlags, StartFlags, find_start
 from bounce_mjx.task.registry import task_name
 from bounce_mjx.task.task import Task
 from bounce_mjx.training import hosts, job
@@ -195,10 +195,11 @@ def train(
         files = (config,)
     elif whole is None:
         files = config
-    values = {"start": word, "config": files, "robot": robot, "world": world}
-    values |= {"warm_start": warm_start}
-    values |= {key: settings[key] for key in ("algorithm", "log_dir") if key in settings}
-    layers = read_layers(validate(Choice, values, PYTHON), whole_config=whole)
+    of_start = {key: settings[key] for key in ("algorithm", "log_dir") if key in settings}
+    of_start["warm_start"] = warm_start
+    begun = find_start(word, validate(StartFlags, of_start, PYTHON), whole)
+    given = {"config": files, "robot": robot, "world": world}
+    layers = layers_on(begun, validate(FileFlags, given, PYTHON), whole_config=whole)
     config = layers.config(settings)
     set_up_jax(config.env)
     console = stdout(quiet=quiet or not hosts.is_leader())
