@@ -110,49 +110,45 @@ def find_start(
     Raises:
       UserError: there is no such thing, or two of these exclude each other.
     """
-    warm_start = flags.warm_start
-    algorithm = flags.algorithm
-    log_dir = flags.log_dir
-    if word is not None and not is_task(word):
-        # Imports JAX, which a task's help does not need.
-        from bounce_mjx.runs.folders import LATEST, is_newest
+    if word is None or is_task(word):
+        return _new_start(word, flags.warm_start, flags, whole_config)
+    if policy_folder(word):
+        if flags.warm_start is not None:
+            raise UserError(
+                f"{word} and the warm start {flags.warm_start} are two policies; leave one out"
+            )
+        return _new_start(None, Path(word), flags, whole_config)
+    # Imports JAX, which a task's help does not need.
+    from bounce_mjx.runs.folders import LATEST, is_newest
 
-        if policy_folder(word):
-            if warm_start is not None:
-                raise UserError(
-                    f"{word} and the warm start {warm_start} are two policies; leave one out"
-                )
-            warm_start, word = Path(word), None
-        elif is_newest(Path(word)) or os.path.isdir(word):
-            return _start_of_run(Path(word), flags)
-        else:
-            known = list(dict.fromkeys((*registered_tasks(), *POLICIES)))
-            own = "a run's folder, or --import FILE.py for a task of your own"
-            advice = suggest(word, [*known, LATEST]) or f"give {', '.join(known)}, {own}"
-            raise UserError(f"there is no task, policy or run {shorten(word)}; {advice}")
+    if is_newest(Path(word)) or os.path.isdir(word):
+        return _start_of_run(Path(word), flags)
+    known = list(dict.fromkeys((*registered_tasks(), *POLICIES)))
+    own = "a run's folder, or --import FILE.py for a task of your own"
+    advice = suggest(word, [*known, LATEST]) or f"give {', '.join(known)}, {own}"
+    raise UserError(f"there is no task, policy or run {shorten(word)}; {advice}")
+
+
+def _new_start(
+    word: str | None, warm_start: Path | None, flags: StartFlags, whole_config: TrainConfig | None
+) -> Start:
+    """The start of a new run.
+
+    Args:
+      word: the task, if the user names it.
+      warm_start: the policy from whose networks and environment it starts.
+    """
+    said: dict[str, Any] = {}
     policy, notes = None, ()
     if warm_start is not None:
-        folder = _folder_of_runs(log_dir, word, whole_config)
+        folder = _folder_of_runs(flags.log_dir, word, whole_config)
         warm_start, policy, notes = _policy_of(warm_start, folder)
-    said: dict[str, Any] = {}
-    if word is not None:
-        task = find_task(word)
-        said["task"] = task_name(task)
-    elif whole_config is not None:
-        task = whole_config.env.task
-    elif policy is not None:
-        task = policy.env.task
-    else:
-        task = find_task(DEFAULT)
-    if whole_config is not None and whole_config.env.task is not task:
-        raise UserError(
-            f"the config is of the task {whole_config.task}, and the first argument is {word}; "
-            "leave it out"
-        )
-    if warm_start is not None:
         said["warm_start"] = warm_start
-    algorithm_name, settings = _algorithm(algorithm, whole_config)
-    if algorithm is not None:
+    task = _task_of(word, whole_config, policy)
+    if word is not None:
+        said["task"] = task_name(task)
+    algorithm_name, settings = _algorithm(flags.algorithm, whole_config)
+    if flags.algorithm is not None:
         said["algorithm"] = algorithm_name
     return Start(
         task=task,
@@ -164,6 +160,27 @@ def find_start(
         warm_start=warm_start,
         notes=notes,
     )
+
+
+def _task_of(
+    word: str | None, whole_config: TrainConfig | None, policy: TrainConfig | None
+) -> type[Task]:
+    """The task that the word names; without one, that of a whole config, of the policy of a warm
+    start, or the default.
+
+    Raises:
+      UserError: the word names another task than a whole config.
+    """
+    if word is None:
+        config = whole_config or policy
+        return find_task(DEFAULT) if config is None else config.env.task
+    task = find_task(word)
+    if whole_config is not None and whole_config.env.task is not task:
+        raise UserError(
+            f"the config is of the task {whole_config.task}, and the first argument is {word}; "
+            "leave it out"
+        )
+    return task
 
 
 def check_not_given(run: Path, given: Mapping[str, Any]) -> None:
