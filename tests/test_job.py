@@ -275,7 +275,7 @@ def test_an_algorithm_brings_its_own_trainer(tmp_path: Path, monkeypatch) -> Non
     run = _run_of(config, None, (), io.StringIO(), scores)
     assert (config.ppo.start_steps, config.iterations_per_block) == (8, 2)
     assert results_of(run)["best_steps"] == 128 and (run / "algorithm/counting.py").exists()
-    longer = read_layers(Choice(start=str(run))).config({"total_steps": 192})
+    longer = read_layers(Choice(word=str(run))).config({"total_steps": 192})
     _run_of(longer, run, (), io.StringIO(), scores)
     assert evaluated_steps(run) == [64, 128, 192]
     (tmp_path / "without.py").write_text(
@@ -349,7 +349,7 @@ def test_a_training_stops_once_its_results_have_a_margin(tmp_path: Path) -> None
     assert f"{run} has met all results, 192 steps; add --total-steps N" in shown.getvalue()
     # Results are not needed to resume.
     (run / "results.json").write_text("damaged")
-    layers = read_layers(Choice(start=str(run)))
+    layers = read_layers(Choice(word=str(run)))
     going_on = layers.config({"total_steps": 10**6})
     assert not going_on.stop_when_solved
     assert going_on.sources["stop_when_solved"] == going_on.sources["total_steps"] == "train"
@@ -690,7 +690,7 @@ def test_a_warm_start_that_meets_all_results_is_trained_until_a_margin(
 ) -> None:
     """The wait for a margin counts from a policy that was trained; one with a margin needs none."""
     networks = "networks of a warm start"
-    monkeypatch.setattr(checkpoints, "read_start", lambda config, env: networks)
+    monkeypatch.setattr(checkpoints, "read_warm_start", lambda config, env: networks)
     returns = dict.fromkeys(range(6), 1.0)
     settings = {"warm_start": Path("robust_small"), "stop_when_solved": True}
     run = train(tmp_path / "a", returns, margins={0: 0.5, 1: 0.5, 3: 1.0}, **settings)
@@ -707,7 +707,7 @@ def test_a_warm_start_that_meets_all_results_is_trained_until_a_margin(
 def test_a_signal_after_the_evaluation_of_a_warm_start_says_how_to_resume(
     tmp_path: Path, monkeypatch
 ) -> None:
-    monkeypatch.setattr(checkpoints, "read_start", lambda config, env: "networks")
+    monkeypatch.setattr(checkpoints, "read_warm_start", lambda config, env: "networks")
 
     def stop(event: Event) -> None:
         os.kill(os.getpid(), signal.SIGTERM)
@@ -896,4 +896,4 @@ def test_a_solved_run_goes_on_with_more_steps_also_beside_a_seed_that_diverged(
     settings = {"num_seeds": SEEDS, "stop_when_solved": True, "margins": {1: 1.0}}
     run = train(tmp_path, RETURNS, trainer=DivergingAtOnce, **settings)
     assert evaluated_steps(run / "seed_000") == [64]
-    assert not read_layers(Choice(start=str(run))).config({"total_steps": 10**6}).stop_when_solved
+    assert not read_layers(Choice(word=str(run))).config({"total_steps": 10**6}).stop_when_solved

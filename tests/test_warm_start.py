@@ -21,7 +21,7 @@ from bounce_mjx.runs.checkpoints import (
     POLICY,
     read_networks,
     read_policy,
-    read_start,
+    read_warm_start,
     save_checkpoint,
 )
 from bounce_mjx.runs.config import load_run_config
@@ -69,7 +69,7 @@ def test_the_value_network_keeps_the_terms_of_both_worlds_and_is_blind_to_new_on
     env = Env(command.env)
     names = names_of_critic_metrics(command.ppo, env)
     assert set(names) == {"n_bounces", "world/restitution", "world/action_latency"}
-    start, seen = read_start(command, env)
+    start, seen = read_warm_start(command, env)
     size = command.env.layout.size
     of_first = jax.random.normal(jax.random.PRNGKey(2), (16, size + len(CRITIC)))
     # The term that is gone has its mean.
@@ -109,7 +109,7 @@ def test_the_small_robust_policy_can_be_trained_further() -> None:
     command = settings_of(args).config
     assert str(command.warm_start) == "robust_small"
     assert command.env.randomization.terms and command.env.randomization.share == 1.0
-    params, _ = read_start(command, Env(command.env))
+    params, _ = read_warm_start(command, Env(command.env))
     checkpoint = find_checkpoint("robust_small")
     own = read_policy(checkpoint, load_run_config(checkpoint.run))
     jax.tree.map(np.testing.assert_array_equal, params.policy, own.params)
@@ -129,7 +129,9 @@ def test_networks_of_an_own_algorithm_are_no_warm_start(tmp_path: Path) -> None:
     flags = [*TINY, "--log-dir", str(tmp_path / "runs"), "--algorithm", "own"]
     config = settings_of(flags).config
     with pytest.raises(UserError, match="Own makes networks of its own, which --warm-start cannot"):
-        read_start(config.model_copy(update={"warm_start": Path("robust_small")}), Env(config.env))
+        read_warm_start(
+            config.model_copy(update={"warm_start": Path("robust_small")}), Env(config.env)
+        )
     # A run whose networks are others.
     run = create_run(config)
     size = config.env.layout.size

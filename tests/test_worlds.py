@@ -240,7 +240,7 @@ def test_a_warm_start_is_in_the_world_in_which_its_policy_is_measured() -> None:
     """One function says what a policy's environment is in a world, for a training too."""
     trained = load_run_config(find_checkpoint("robust_small").run).env
     for world in (None, "fast_servo"):
-        choice = Choice(start="robust_small", world=None if world is None else Path(world))
+        choice = Choice(word="robust_small", world=None if world is None else Path(world))
         begun = read_layers(choice, resource_path("configs/cpu.yaml")).config().env
         assert begun == env_in_world(trained, world)
 

@@ -23,7 +23,7 @@ from bounce_mjx.evaluation import config as evaluation
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import RandomizationConfig
 
-# What is of the evaluation alone; a name that ends with = has a value.
+# Flags that `play` lacks, which the command of a film leaves out; one that ends with = has a value.
 _NOT_OF_PLAY = ("--failures", "--contacts", "--limits", "--json=", "--physics=")
 
 
@@ -89,8 +89,7 @@ def main(args: Sequence[str]) -> None:
     check_output(command.json_file, "--json")
     console = stdout()
     world = world_of_flags(command.world, command.randomization)
-    command.check_log_dir(command.checkpoint)
-    checkpoint = command.choose(command.checkpoint, command.robot)
+    (checkpoint,) = command.choose(command.checkpoint, robot=command.robot)
     config = command.config_of(checkpoint, command.robot, world)
     if command.limits and config.env.robot.limits.velocity is None:
         raise UserError("the policy's arm has no command limits (env.robot.limits); omit --limits")
@@ -98,7 +97,7 @@ def main(args: Sequence[str]) -> None:
     goals = given_goals.checked(config.env)
     set_up_jax(evaluation.on_engine(config.env, command.physics))
     checkpoint, policy, actor = read_actor(checkpoint, config)
-    # Beside what is no run, nothing is written.
+    # In the user's run; for a policy of the package and the mirror law, here.
     picture = (checkpoint.run if is_users_run(checkpoint.run) else Path()) / "failures.png"
     steps = f" ({checkpoint.steps:,} steps)" if checkpoint.steps else ""
     print(f"checkpoint: {checkpoint.folder}{steps}")

@@ -29,9 +29,9 @@ def main(args: Sequence[str]) -> None:
     from bounce_mjx.training.setup import set_up_jax
 
     check_output(command.onnx, "--onnx")
-    command.check_log_dir(command.checkpoint)
+    folder = command.folder_for(command.checkpoint)
     set_up_jax()
-    checkpoint = choose_checkpoint(command.checkpoint, command.folder)
+    checkpoint = choose_checkpoint(command.checkpoint, folder)
     print(f"checkpoint: {checkpoint.folder} ({checkpoint.steps:,} steps)")
     content = export_onnx(checkpoint)
     write_output(command.onnx, content)

@@ -67,7 +67,6 @@ def main(args: Sequence[str]) -> None:
     command, given_goals = parse_with_goals(PlayCommand, args, prog="bounce-mjx play")
     if len(command.checkpoints) > MAX_ENVS:
         raise UserError(f"{len(command.checkpoints)} policies are given; give at most {MAX_ENVS}")
-    command.check_log_dir(*command.checkpoints or (None,))
     world = world_of_flags(command.world, command.randomization)
     if command.condition is not None:
         # The suite changes the named world, or that of the training.
@@ -84,7 +83,7 @@ def main(args: Sequence[str]) -> None:
     from bounce_mjx.viewers.show import Shown, show
     from bounce_mjx.viewers.simulation import make_policy_controller
 
-    chosen = [command.choose(path, command.robot) for path in command.checkpoints or (None,)]
+    chosen = command.choose(*command.checkpoints or (None,), robot=command.robot)
     configs = [command.config_of(checkpoint, command.robot, world) for checkpoint in chosen]
     # All are of one task, which `show` checks, and so have the same goals.
     for config in configs:

@@ -19,7 +19,7 @@ from bounce_mjx.config.settings import Count, NonNegativeInt
 from bounce_mjx.config.user_code import import_flags
 from bounce_mjx.evaluation import config as evaluation
 
-# What is of the measurement alone; a name that ends with = has a value.
+# Flags that `play` lacks, which the command of a film leaves out; one that ends with = has a value.
 _NOT_OF_PLAY = ("--assumed", "--out=", "--physics=")
 
 
@@ -62,8 +62,7 @@ def main(args: Sequence[str]) -> None:
     from bounce_mjx.training.setup import set_up_jax
 
     console = stdout()
-    command.check_log_dir(command.checkpoint)
-    checkpoint = command.choose(command.checkpoint, command.robot)
+    (checkpoint,) = command.choose(command.checkpoint, robot=command.robot)
     config = command.config_of(checkpoint, command.robot)
     path, conditions, num_assumed = suite_conditions(command.suite, config, command.world)
     suite, version = str(path), read_suite(path).version

@@ -26,7 +26,7 @@ PROG = "bounce-mjx train"
 ABOUT = "Trains a policy; by default, one that keeps the ball bouncing."
 
 _SHORT_HELP = (
-    "start config robot world warm_start seed num_seeds total_steps stop_when_solved "
+    "word config robot world warm_start seed num_seeds total_steps stop_when_solved "
     "log_dir report watch print_config algorithm ppo.num_envs ppo.learning_rate ppo.hidden_layers"
 ).split()
 
@@ -77,7 +77,7 @@ class Settings(NamedTuple):
 
 
 class TrainCommand(NamedTuple):
-    """A command line that was read; no file of settings was."""
+    """A command line that was read; of files, only what it begins with, such as a run's config."""
 
     start: Start
     """What the first word, --warm-start and --algorithm mean."""
@@ -126,10 +126,10 @@ def read_command(args: Sequence[str]) -> TrainCommand:
         usual = layers_on(start, first, default_preset(has_plugin())).config()
         _print_help(fields, usual, is_short="--help-all" not in helps)
     given = read_flags(fields, words, prog=PROG, description=ABOUT, defaults={})
-    if given.get("start") != word:
+    if given.get("word") != word:
         raise UserError(
-            f"{given['start']} is what the training begins with; give it first: {PROG} "
-            f"{given['start']} ..."
+            f"{given['word']} is what the training begins with; give it first: {PROG} "
+            f"{given['word']} ..."
         )
     flags = typed(TrainFlags, given, flag_names(fields), PROG)
     said = {key: value for key, value in given.items() if key in start.fields}

@@ -137,31 +137,51 @@ class WhichPolicy(StrictModel):
     log_dir: Path | None = None
     """Folder in which to look for the newest run; by default, that of the task's runs."""
 
-    @property
-    def folder(self) -> Path:
-        """`log_dir`, or the folder of the task's runs."""
-        return self.log_dir or runs_folder(find_task(self.task or DEFAULT))
-
-    def check_log_dir(self, *paths: Path | None) -> None:
-        """Refuses a folder in which to look for the newest run where the user names every policy.
-
-        Raises:
-          UserError: --log-dir is given, and no path stands for the newest run.
-        """
-        if self.log_dir is not None:
-            from bounce_mjx.runs.folders import check_newest
-
-            check_newest(paths)
-
-    def choose(self, path: Path | None, robot: Path | None = None) -> "Checkpoint":
-        """`choose_checkpoint`, or `MIRROR_LAW` for the word mirror.
+    def choose(self, *paths: Path | None, robot: Path | None = None) -> list["Checkpoint"]:
+        """The checkpoint of each path: `choose_checkpoint`, or `MIRROR_LAW` for the word mirror.
 
         Args:
           robot: of the mirror law.
 
         Raises:
-          UserError: there is none, or a robot is given for a policy.
+          UserError: there is none, a robot is given for a policy, or --log-dir beside named ones.
         """
+        folder = self.folder_for(*paths)
+        return [self._choose(path, folder, robot) for path in paths]
+
+    def choose_runs(self, *paths: Path | None) -> list[Path]:
+        """The run of each path, with its log: `run_or_newest`.
+
+        Raises:
+          UserError: there is none, it is a policy of the package, which has no log, or --log-dir is
+            given beside named ones.
+        """
+        from bounce_mjx.runs.folders import run_or_newest
+
+        folder = self.folder_for(*paths)
+        for path in paths:
+            if policy_folder(path) is not None:
+                raise UserError(
+                    f"the policy {path} comes with the package, without the log of its training; "
+                    "give a run's folder"
+                )
+        return [run_or_newest(path, folder) for path in paths]
+
+    def folder_for(self, *paths: Path | None) -> Path:
+        """Where the newest run is looked for: `log_dir`, or the folder of the task's runs.
+
+        Raises:
+          UserError: --log-dir is given, and each path is that of a run or a policy.
+        """
+        if self.log_dir is None:
+            return runs_folder(find_task(self.task or DEFAULT))
+        from bounce_mjx.runs.folders import check_newest
+
+        check_newest(paths)
+        return self.log_dir
+
+    @staticmethod
+    def _choose(path: Path | None, folder: Path, robot: Path | None) -> "Checkpoint":
         from bounce_mjx.runs.folders import MIRROR_LAW, choose_checkpoint
 
         is_folder = path is not None and os.path.isdir(path)
@@ -171,22 +191,7 @@ class WhichPolicy(StrictModel):
             raise UserError(f"there is no run and no policy {path}; {near}")
         if robot is not None:
             raise UserError("--robot is for the mirror law; omit it, or give mirror as checkpoint")
-        return choose_checkpoint(path, self.folder)
-
-    def choose_run(self, path: Path | None) -> Path:
-        """A run with its log: `run_or_newest`.
-
-        Raises:
-          UserError: there is none, or it is a policy of the package, which has no log.
-        """
-        from bounce_mjx.runs.folders import run_or_newest
-
-        if policy_folder(path) is not None:
-            raise UserError(
-                f"the policy {path} comes with the package, without the log of its training; give "
-                "a run's folder"
-            )
-        return run_or_newest(path, self.folder)
+        return choose_checkpoint(path, folder)
 
     def config_of(
         self, checkpoint: "Checkpoint", robot: Path | None = None, world: World = AS_TRAINED

@@ -254,7 +254,7 @@ def load_run_config(run: Path) -> TrainConfig:
     values = {"task": DEFAULT} | read_config_file(path)
     values.pop(BASE, None)
     sources = _sources_in(values.pop(SOURCES, None))
-    its_task = task_in(f"the run {run}", values["task"], code_of(run, "task"))
+    its_task = task_named_by(f"the run {run}", values["task"], code_of(run, "task"))
     if not is_code_of(its_task, run, "task"):
         now = code_file_of(its_task)
         warn_once(
@@ -346,7 +346,7 @@ def is_code_of(kind: type, run: Path, key: str) -> bool:
     return copy is None or now is None or copy.read_bytes() == now.content
 
 
-def task_in(source: str, name: str, code: Path | None = None) -> type[Task]:
+def task_named_by(source: str, name: str, code: Path | None = None) -> type[Task]:
     """The task that a file or a run names.
 
     Args:

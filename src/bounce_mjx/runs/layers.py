@@ -31,10 +31,10 @@ import pydantic
 from pydantic.fields import FieldInfo
 
 from bounce_mjx.config.files import differing_keys, flat
-from bounce_mjx.config.settings import Layer, default_of, has_default, merged, nested
+from bounce_mjx.config.settings import default_of, has_default, merged, nested
 from bounce_mjx.config.validation import describe, groups_of, path_of
 from bounce_mjx.errors import UserError, shorten
-from bounce_mjx.learning.config import PPOConfig
+from bounce_mjx.learning.config import NETWORK_KEYS, PPOConfig
 from bounce_mjx.runs.config import (
     DEFAULT_SOURCE,
     RESUMABLE_KEYS,
@@ -42,7 +42,7 @@ from bounce_mjx.runs.config import (
 )
 from bounce_mjx.runs.presets import BASE, SOURCES, preset_files, read_config_file, shown_file
 from bounce_mjx.runs.start import Choice, FileFlags, Start, check_not_given, find_start
-from bounce_mjx.runs.worlds import layers_of_environment
+from bounce_mjx.runs.worlds import Layer, layers_of_environment
 from bounce_mjx.world.named import without_idle_curriculum
 
 FLAGS = "flags"
@@ -65,7 +65,7 @@ def read_layers(
     Raises:
       UserError: as `find_start` and `layers_on`.
     """
-    return layers_on(find_start(choice.start, choice, whole_config), choice, machine, whole_config)
+    return layers_on(find_start(choice.word, choice, whole_config), choice, machine, whole_config)
 
 
 def layers_on(
@@ -187,8 +187,6 @@ def _as_in_yaml(value: Any) -> Any:
 
 def _with_networks(of_env: Layer, start: Start) -> Layer:
     """The layer of the policy of a warm start: its environment, its task and its networks."""
-    from bounce_mjx.runs.checkpoints import NETWORK_KEYS
-
     networks = start.policy.ppo.model_dump(include={*NETWORK_KEYS, "critic_metrics"})
     values = of_env.values | {"task": start.policy.task, "ppo": networks}
     return of_env._replace(source=f"the warm start {start.warm_start}", values=values)
@@ -236,7 +234,7 @@ class Layers:
             run. The error names the layer that set it.
         """
         user_source = PYTHON if flags is None else FLAGS
-        # A start is what it was found to be, such as a checkpoint.
+        # The policy of a warm start is the checkpoint that was found, not the word for it.
         user = self._layer_of_user(user_source, {**(said or {}), **self.start.said})
         above = [*self._beyond_solved(user), user]
         layers = [*self.below, *above]
@@ -427,5 +425,5 @@ def read_preset(
     files = (config,) if isinstance(config, Path) else tuple(config or ())
     for layer in reversed(_layers_of_files(file for file in files if os.path.isfile(file))):
         task = task or layer.values.get("task")
-    choice = Choice(start=task, config=files, robot=robot, world=world)
+    choice = Choice(word=task, config=files, robot=robot, world=world)
     return read_layers(choice, machine).config()

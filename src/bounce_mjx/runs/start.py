@@ -59,7 +59,7 @@ class ChoiceFlags(StartFlags, FileFlags):
 class Choice(ChoiceFlags):
     """The first word and those flags: all that decides which layers there are."""
 
-    start: Annotated[
+    word: Annotated[
         str | None,
         Flag(metavar="[TASK|POLICY|RUN]", is_positional=True, instead_of=("--task", "--resume")),
     ] = None
@@ -80,7 +80,8 @@ class Start(NamedTuple):
     """Type of the settings of the algorithm."""
     algorithm_name: str
     said: dict[str, Any]
-    """What the user says by it, by keys of the config."""
+    """What the user names of it, by the keys of the config: the task, the algorithm, the policy of
+    a warm start. It wins over every layer."""
     policy: TrainConfig | None = None
     """Config of the policy of a warm start."""
     warm_start: Path | None = None
@@ -204,6 +205,7 @@ def _start_of_run(word: Path, flags: StartFlags) -> Start:
     if flags.log_dir is not None:
         check_newest([word])
     check_not_given(word, {"algorithm": flags.algorithm, "warm_start": flags.warm_start})
+    # Without a folder, latest is the newest run of the default task.
     place = run_or_newest(word, flags.log_dir or runs_folder(find_task(DEFAULT)))
     run = run_of(place)
     config = load_run_config(run)
@@ -239,8 +241,8 @@ def _policy_of(path: Path, log_dir: Path) -> tuple[Path, TrainConfig, tuple[str,
 
     notes: list[str] = []
     checkpoint = choose_checkpoint(path, log_dir, notes.append)
-    start = path if policy_folder(path) else checkpoint.folder
-    return start, load_run_config(checkpoint.run), tuple(notes)
+    place = path if policy_folder(path) else checkpoint.folder
+    return place, load_run_config(checkpoint.run), tuple(notes)
 
 
 def _folder_of_runs(

@@ -122,7 +122,7 @@ def open_job(
     env = Env(config.env)
     trainer = make_trainer(config, env)
     is_warm = config.warm_start is not None and resume is None
-    networks = checkpoints.read_start(config, env) if is_warm else None
+    networks = checkpoints.read_warm_start(config, env) if is_warm else None
     # Before, a signal ends the process by its default action.
     stop = stack.enter_context(StopRequest())
     run = _make_run(config) if resume is None else folders.run_of(resume)
@@ -194,7 +194,7 @@ class Job:
     """Whether the run is not resumed."""
     networks: Any
     """Parameters of both networks of a warm start and the statistics of their inputs, as from
-    `checkpoints.read_start`; None without one."""
+    `checkpoints.read_warm_start`; None without one."""
     console: Console
     callbacks: list[Any]
     pool: concurrent.futures.Executor

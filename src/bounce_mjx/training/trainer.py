@@ -52,7 +52,7 @@ class Trainer(Protocol):
 
         Args:
           networks: those of an earlier training, which each seed starts with, and the statistics of
-            their inputs (`checkpoints.read_start`); not with a state.
+            their inputs (`checkpoints.read_warm_start`); not with a state.
         """
 
     def train_block(self) -> BlockMetrics:
