@@ -41,7 +41,9 @@ _REACH = 0.15
 # Time in which a ball near the paddle leaves the straight line on which a hand would carry it, and
 # the time in which it is seen to fall, s.
 _HELD = 0.4
-_LEAVING = 1.0
+_LEAVING = 2.0
+# Pictures in 0.4 s, of which fewer do not tell a line from bounces.
+_FEW = 5
 # How far the root mean square of noise may be above its standard deviation, in deviations of it.
 _ABOVE = 3.5
 
@@ -222,7 +224,7 @@ def _touching(
     if near is None:
         near = Near(float(flight.times[-1]), flight.times[-1:], flight.places[-1:, 2])
     near = _still_near(near, time, place)
-    if not bounds.may_rest:
+    if not bounds.may_rest and len(near.times) >= _FEW:
         seconds = time - near.since
         if seconds > _HELD and _is_straight(near, bounds.noise):
             reason = f"has been near the paddle for {seconds:.2g} s as if it were held there"
@@ -244,8 +246,6 @@ def _still_near(near: Near, time: float, place: np.ndarray) -> Near:
 def _is_straight(near: Near, noise: float) -> bool:
     """Whether the heights are those of a constant velocity, but for a noise (m)."""
     count = len(near.times)
-    if count < 3:
-        return True
     t = near.times - near.times.mean()
     left = near.heights - near.heights.mean()
     left -= t * ((t @ left) / (t @ t))
