@@ -117,7 +117,8 @@ class Fit(NamedTuple):
     """Pictures against a ball's fall."""
 
     ratio: float
-    """What is left, as a share of the bound; above 1, the ball does not fall."""
+    """What is left, as a share of the bound; above 1, the ball does not fall. Below 1 it may be
+    less."""
     is_known: bool
     """Whether a ball at rest would be above 1; if not, a ratio below 1 says nothing."""
 
@@ -144,9 +145,16 @@ def fit_fall(times: np.ndarray, places: np.ndarray, noise: float, push: float = 
     left -= t[:, None] * velocity
     bend -= t * ((t @ bend) / spread)
     bend_size = math.sqrt(bend @ bend)
-    along = (bend @ left / bend_size).tolist()
     squared_speed = float(velocity @ velocity) + GRAVITY**2 * spread / count
     bound = _DEVIATIONS * math.sqrt(noise**2 + _TIMING**2 * squared_speed)
+    at_rest = 0.5 * GRAVITY * bend_size
+    is_known = at_rest > _DEVIATIONS * noise
+    # No projection is longer than the whole, which mostly is short enough.
+    whole = np.sqrt((left * left).sum(axis=0)).tolist()
+    most = math.hypot(*whole) / bound
+    if most <= 1.0:
+        return Fit(most, is_known)
+    along = (bend @ left / bend_size).tolist()
     drag = 0.5 * _DRAG * squared_speed
     alone_bound = bound + drag * float(np.abs(bend).max())
     along_bound = bound + drag * bend_size
@@ -163,8 +171,7 @@ def fit_fall(times: np.ndarray, places: np.ndarray, noise: float, push: float = 
         math.hypot(along[0], along[1]) / along_pushed,
         math.hypot(steps[0], steps[1]) / along_pushed,
     )
-    at_rest = 0.5 * GRAVITY * bend_size
-    return Fit(ratio, at_rest > _DEVIATIONS * noise)
+    return Fit(ratio, is_known)
 
 
 def _along_steps(t: np.ndarray, spread: float, left: np.ndarray) -> np.ndarray:

@@ -337,14 +337,17 @@ class Samples:
             return moved
         by_angles = angles - first.angles
         by_velocities = way - first.way
-        fastest = np.max([one.speeds for one in moved], axis=0)
-        largest_way = np.maximum(np.abs(by_angles), fastest * duration)
-        # One velocity may be wrong, and all a little late.
+        apart = np.abs(by_angles - by_velocities)
         # The integral of a noise grows with the root of the time.
         noise = self._velocity_noise * math.sqrt(duration * self._dt)
-        allowed = _LEAST_WAY + self._noise + noise + self._velocity_bias * duration
-        allowed = allowed + fastest * (_VELOCITY_LAG + self._dt) + _OF_WAY * largest_way
-        beyond = np.abs(by_angles - by_velocities) - allowed
+        at_rest = _LEAST_WAY + self._noise + noise + self._velocity_bias * duration
+        if max(apart.tolist()) <= at_rest:
+            return moved
+        # One velocity may be wrong, and all a little late.
+        fastest = np.max([one.speeds for one in moved], axis=0)
+        largest_way = np.maximum(np.abs(by_angles), fastest * duration)
+        allowed = at_rest + fastest * (_VELOCITY_LAG + self._dt) + _OF_WAY * largest_way
+        beyond = apart - allowed
         if max(beyond.tolist()) <= 0.0:
             return moved
         joint = int(np.argmax(beyond))
