@@ -28,7 +28,7 @@ from bounce_mjx.identify.unknowns import Layout
 from bounce_mjx.identify.windows import cut_enough
 from bounce_mjx.rehearsal.arm import SimulatedArm, goals_in_turn, middle, rate_of
 from bounce_mjx.rehearsal.camera import NoCamera
-from bounce_mjx.rehearsal.faults import KINDS, Injection, named_fault
+from bounce_mjx.rehearsal.faults import KINDS, Injection, frozen, named_fault
 from bounce_mjx.rehearsal.operator import SimulatedOperator
 from bounce_mjx.world.model import world_model
 
@@ -176,6 +176,36 @@ def test_an_episode_waits_for_a_ball_over_the_paddle() -> None:
     session, _ = rehearsed("robust", seconds=1.0, ball_position_bias=np.array([0.0, 0.4, 0.0]))
     assert not session.episodes and session.fault is None
     assert "and an episode starts with the ball over it" in session.reason
+
+
+class WithoutAges(SimulatedArm):
+    """Its camera gives whole millimetres, and does not say when it took a picture."""
+
+    def read(self) -> dict[str, Any]:
+        measured = super().read()
+        measured.pop("ball_age", None)
+        if "ball_position" in measured:
+            measured["ball_position"] = np.round(measured["ball_position"], 3)
+        return measured
+
+
+@pytest.mark.parametrize(
+    "name, stops, fault", [("catch", 9.0, None), ("robust", 1.5, "old_picture")]
+)
+def test_a_camera_without_ages_sees_a_ball_at_rest_and_stops_an_arm_only_when_it_stands_still(
+    name: str, stops: float, fault: str | None
+) -> None:
+    """A caught ball repeats its place after some 2 s; one that bounces does not."""
+    config = environment_config(policy=name, world="training")
+    injection = Injection(frozen("ball_position"), after=stops)
+    arm = WithoutAges(config, middle(config), injection=injection)
+    operator = SimulatedOperator(arm)
+    goals = goals_in_turn(config, {})
+    session = play(load_policy(name), arm, 4.0, operator, goals, {})
+    (episode,) = session.episodes
+    assert session.fault == fault
+    if fault is not None:
+        assert stops < episode.seconds < stops + 0.3
 
 
 def test_only_the_robust_policy_bounces_with_a_late_camera() -> None:

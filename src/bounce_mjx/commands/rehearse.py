@@ -117,9 +117,11 @@ def _policy_file(command: RehearseCommand) -> Path:
     if command.policy is not None:
         is_file = command.policy.is_file()
         if is_file or policy_folder(command.policy) is not None:
-            command.check_log_dir(command.policy)
+            # Refuses --log-dir beside it.
+            command.folder_for(command.policy)
             return command.policy
-    return command.choose(command.policy).folder
+    (checkpoint,) = command.choose(command.policy)
+    return checkpoint.folder
 
 
 def _config_of_policy(command: RehearseCommand, policy: Path) -> "WorldConfig":
