@@ -114,7 +114,8 @@ def test_the_commands_of_the_tutorial_run(tmp_path: Path, monkeypatch, capsys, r
         else:
             words += SHORT[name].split()
         if name == "plot":
-            copy_of_run(tmp_path / "runs/line", capsys.readouterr().out)
+            trained = capsys.readouterr().out
+            copy_of_run(tmp_path / "runs/line", trained)
             runs = sorted(map(str, (tmp_path / "runs/line").iterdir()))
             words = [*runs, *(word for word in words if "*" not in word), "--formats", "svg"]
         try:
@@ -124,8 +125,10 @@ def test_the_commands_of_the_tutorial_run(tmp_path: Path, monkeypatch, capsys, r
             assert end.code in (0, 1), capsys.readouterr().err
         ran.append(name)
     assert ran == ["view", "train", "eval", "train", "plot", "play", "export", "rehearse"]
-    assert "left of the line" in capsys.readouterr().out
+    assert "left of the line" in trained
     for file in ("view.html", "line.mp4", "line.onnx"):
         assert (tmp_path / file).stat().st_size > 1000
-    (report,) = tmp_path.glob("runs/line/*/report.html")
-    assert "left of the line" in report.read_text(encoding="utf-8")
+    for report in tmp_path.glob("runs/line/*/report.html"):
+        assert "left of the line" in report.read_text(encoding="utf-8")
+    legend = (tmp_path / "plots/curves.svg").read_text(encoding="utf-8")
+    assert "weight 0.2" in legend and "weight 2.0" in legend
