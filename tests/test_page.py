@@ -17,9 +17,13 @@ import msgspec
 import numpy as np
 import pytest
 import viser
+import yaml
 from rich.console import Console
 
 import viewing
+from arms import ARM
+from bounce_mjx import EnvConfig
+from bounce_mjx.commands import adopt
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.runs.config import TrainConfig
@@ -132,6 +136,24 @@ def test_only_its_own_page_may_connect(host, allowed, pages, strangers, capfd) -
         with urllib.request.urlopen(address) as answer:
             assert b"<html" in answer.read(2000)
     assert capfd.readouterr() == ("", "")
+
+
+def test_each_body_of_an_arm_has_its_place_whatever_its_name(tmp_path) -> None:
+    """Of a hand-written arm, bodies have no names; of another, slashes."""
+    names = iter(("", "", "wam", "wam/hand", "wam/bat", ""))
+    text = re.sub("<body ", lambda _: f'<body name="{next(names)}" ', ARM)
+    (tmp_path / "arm.xml").write_text(text.replace(' name=""', ""))
+    adopt.main([str(tmp_path / "arm.xml"), "--site", "tool", "--out", str(tmp_path / "arm.yaml")])
+    settings = yaml.safe_load((tmp_path / "arm.yaml").read_text())
+    env = Env(EnvConfig.model_validate(settings["env"]))
+    server = viser.ViserServer(port=0, verbose=False)
+    try:
+        bodies = Scene(server, env, 1)._bodies
+        places = [handle.name for handle in bodies.values()]
+        assert len(set(places)) == len(places) >= 7
+        assert all(place.count("/") == 2 for place in places)
+    finally:
+        server.stop()
 
 
 def test_the_printed_address_is_that_of_the_server(monkeypatch) -> None:

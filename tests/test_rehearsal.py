@@ -349,4 +349,4 @@ def test_the_page_goes_from_an_arms_file_to_its_rehearsed_motion(tmp_path, monke
                 main(words)
         else:
             main(words)
-    assert Path("world.html").exists() and Path("simulated.csv").stat().st_size > 1_000_000
+    assert Path("world.html").exists() and Path("arm.csv").stat().st_size > 1_000_000

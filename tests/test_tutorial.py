@@ -2,12 +2,14 @@
 
 import re
 import shlex
+import shutil
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import yaml
 
 from bounce_mjx import task
 from bounce_mjx.commands.main import main
@@ -81,9 +83,21 @@ def test_the_policy_sees_the_line_which_moves_in_every_world(line: type[Bounce])
     assert env.config.in_world(task.RandomizationConfig()).randomization.goal_interval == (3, 3)
 
 
+def copy_of_run(runs: Path, printed: str) -> None:
+    """Copies the only run of a folder, with the config that `train --print-config` printed last."""
+    (run,) = runs.iterdir()
+    config = printed[printed.rindex("task: line") :]
+    assert yaml.safe_load(config)["env"]["reward"]["left_of_line"]["weight"] == 0.2
+    shutil.copytree(run, runs / "other")
+    (runs / "other" / "config.yaml").write_text(config)
+
+
 @pytest.mark.slow
-def test_the_commands_of_the_tutorial_run(tmp_path: Path, monkeypatch, capsys) -> None:
-    """From top to bottom, with small trainings, which no result passes."""
+def test_the_commands_of_the_tutorial_run(tmp_path: Path, monkeypatch, capsys, request) -> None:
+    """From top to bottom, with a small training, which no result passes. LLVM takes most of the
+    time, and its optimisations change nothing that this test sees."""
+    jax.config.update("jax_disable_most_optimizations", True)
+    request.addfinalizer(lambda: jax.config.update("jax_disable_most_optimizations", False))
     monkeypatch.chdir(tmp_path)
     lines = re.findall(r"^ {4}bounce-mjx (.+)$", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
     ran = []
@@ -92,12 +106,16 @@ def test_the_commands_of_the_tutorial_run(tmp_path: Path, monkeypatch, capsys) -
         if name == "view":
             # The page of a browser waits for its user.
             words += ["--html", "view.html", "--seconds", "0.1"]
+        elif name == "train" and "train" in ran:
+            # Its programs differ from the first one's by a constant, and take as long to compile.
+            words += [*TINY, "--print-config"]
         elif name == "train":
-            # One report is enough.
-            words += [*TINY, "--total-steps", "128", *["--no-report"] * ("train" in ran)]
+            words += [*TINY, "--total-steps", "128"]
         else:
             words += SHORT[name].split()
         if name == "plot":
+            trained = capsys.readouterr().out
+            copy_of_run(tmp_path / "runs/line", trained)
             runs = sorted(map(str, (tmp_path / "runs/line").iterdir()))
             words = [*runs, *(word for word in words if "*" not in word), "--formats", "svg"]
         try:
@@ -107,8 +125,10 @@ def test_the_commands_of_the_tutorial_run(tmp_path: Path, monkeypatch, capsys) -
             assert end.code in (0, 1), capsys.readouterr().err
         ran.append(name)
     assert ran == ["view", "train", "eval", "train", "plot", "play", "export", "rehearse"]
-    assert "left of the line" in capsys.readouterr().out
+    assert "left of the line" in trained
     for file in ("view.html", "line.mp4", "line.onnx"):
         assert (tmp_path / file).stat().st_size > 1000
-    (report,) = tmp_path.glob("runs/line/*/report.html")
-    assert "left of the line" in report.read_text(encoding="utf-8")
+    for report in tmp_path.glob("runs/line/*/report.html"):
+        assert "left of the line" in report.read_text(encoding="utf-8")
+    legend = (tmp_path / "plots/curves.svg").read_text(encoding="utf-8")
+    assert "weight 0.2" in legend and "weight 2.0" in legend

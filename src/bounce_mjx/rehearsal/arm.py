@@ -69,7 +69,8 @@ def in_words(world: Mapping[str, np.ndarray]) -> str:
         words.append(f"camera_rate {float(world['camera_rate']):.0f} Hz")
     others = len(world) - len(words)
     if others:
-        words.append(f"{others} more terms" if words else f"{others} terms")
+        more = "more " if words else ""
+        words.append(f"{others} {more}term{'s' if others > 1 else ''}")
     return ", ".join(words) or "without delays or noise"
 
 

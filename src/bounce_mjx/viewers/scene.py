@@ -74,7 +74,8 @@ class Scene:
         for body, shapes in body_scenes(model):
             is_marker = model.body_mocapid[body] >= 0
             self._bodies[body] = scene.add_batched_glb(
-                f"/robot/{model.body(body).name}",
+                # By its number: a body need not have a name, and a slash in one would nest it.
+                f"/robot/{body}",
                 shapes.export(file_type="glb"),
                 batched_wxyzs=np.tile([1.0, 0.0, 0.0, 0.0], (num_envs, 1)),
                 batched_positions=self._offsets,
