@@ -119,6 +119,10 @@ MISTAKES = (
     ("plot {run} --formats gif", "--formats is gif", "'png' or 'svg'"),
     ("plot {run} --out {run}/config.yaml", "cannot be written", "--out"),
     ("train --eval-seed 20000", "eval_seed: 20000 is the seed of bounce-mjx eval,", "give another"),
+    (
+        "train catch --warm-start robust",
+        "the warm start is a policy of the task bounce, and this training of catch; leave catch",
+    ),
     ("train --warm-start robust", "without its value network; give robust_small"),
     ("train --warm-start robust_small --hidden-layers 8", "other hidden layers"),
     ("train --warm-start robust_small --observation.action 1", "another observation"),

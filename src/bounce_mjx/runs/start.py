@@ -170,7 +170,8 @@ def _task_of(
     start, or the default.
 
     Raises:
-      UserError: the word names another task than a whole config.
+      UserError: the word names another task than a whole config, or one that neither extends the
+        policy's nor is extended by it.
     """
     if word is None:
         config = whole_config or policy
@@ -181,6 +182,13 @@ def _task_of(
             f"the config is of the task {whole_config.task}, and the first argument is {word}; "
             "leave it out"
         )
+    if policy is not None:
+        its_task = policy.env.task
+        if not (issubclass(task, its_task) or issubclass(its_task, task)):
+            raise UserError(
+                f"the warm start is a policy of the task {policy.task}, and this training of "
+                f"{word}; leave {word} out, or give a policy of it"
+            )
     return task
 
 

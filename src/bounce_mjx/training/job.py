@@ -6,8 +6,9 @@ From a signal to its checkpoint: `StopRequest` notes the signal, the block goes 
 (`train_block`), an evaluation that is due is left out (on several hosts it is done, as a process
 that stopped alone would keep the others waiting), `is_stopping` ends the loop, and `finish` saves
 the state, waits until it is written, and raises `TrainingStopped` with the command that resumes
-the run. An exception in a callback takes the same way, and is raised at its end; the callback is
-called no more.
+the run. A second signal ends the process at once (`interrupt.py`); what was saved before it stays.
+An exception in a callback takes the way of a first signal, and is raised at its end; the callback
+is called no more.
 """
 
 import concurrent.futures
@@ -469,6 +470,7 @@ class Job:
         if not stopping and not self.evaluate_best():
             stopping = True
             where = ", before the final evaluation"
+        # Every process waits here for the others, of which none needs it any more.
         jax.distributed.shutdown()
         if self.failure is not None:
             self.say(f"a callback failed after {self.steps:,} steps; {self.continuing}")
