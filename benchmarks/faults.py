@@ -24,24 +24,21 @@ import functools
 import math
 import multiprocessing
 import sys
-from collections import deque
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
-import mujoco
 import numpy as np
 
 from bounce_mjx import load_policy
 from bounce_mjx.deploy.motion import paddle_position
 from bounce_mjx.errors import UserError
-from bounce_mjx.physics import CEngine
 from bounce_mjx.rehearsal import faults as inject
+from bounce_mjx.rehearsal.arm import SimulatedArm
 from bounce_mjx.rehearsal.faults import Act, Moment
+from bounce_mjx.rehearsal.operator import SimulatedOperator
 from bounce_mjx.resources import POLICIES, resource_path
-from bounce_mjx.robot.model import balls_above, find_addresses
 from bounce_mjx.runs.config import load_run_config
-from bounce_mjx.world.model import world_model
+from bounce_mjx.world.config import WorldConfig
 
 RATE = 500.0
 """Of the commands, Hz."""
@@ -55,152 +52,35 @@ BOX = 0.5
 """Half of the box around the paddle's home, m."""
 FIRST_COMMAND = 0.02
 """What the first command may be off the arm, rad."""
+SHOWN = 0.03
+"""Distance of a joint from its command at which it lacks torque, rad; in play it lags by less."""
 OVERSHOOT = 0.02
 """What the arm may be off the box, m."""
 
 
-class Sensors(NamedTuple):
-    """The camera and the encoders."""
-
-    rate: float
-    """Of the camera's pictures, Hz."""
-    delay: float
-    """Of the pictures, s."""
-    noise: float
-    """Of the balls' positions, m."""
-    angle_noise: float
-    """Of the encoders, rad."""
-
-
-REAL = Sensors(rate=120.0, delay=0.01, noise=0.001, angle_noise=1e-4)
-PERFECT = Sensors(rate=1e3, delay=0.0, noise=0.0, angle_noise=0.0)
+REAL = {
+    "camera_rate": 120.0,
+    "ball_latency": 0.01,
+    "ball_position_noise": 0.001,
+    "ball_velocity_noise": 0.1,
+    "joint_angle_noise": 1e-4,
+    "joint_velocity_noise": 0.01,
+}
+"""The world of the camera and the encoders (`env.randomization` has the units)."""
+PERFECT: dict[str, float] = {}
 """For the policies that were trained without errors of the sensors."""
 
 
 @functools.cache
-def _model(name: str) -> tuple[mujoco.MjModel, Any]:
-    env = load_run_config(resource_path(POLICIES[name])).env
-    return world_model(env, visual=False), env
+def _config(name: str) -> WorldConfig:
+    return load_run_config(resource_path(POLICIES[name])).env
 
 
-@functools.cache
-def _throw_of(name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Positions and velocities of the balls [B, 3] at the start of an episode."""
-    env = _model(name)[1]
-    task = env.task(env)
-    goal = {key: jnp.array(0.5 * (x.low + x.high)) for key, x in env.goals.items()}
-    thrown = task.throw(jnp.full(task.num_draws, 0.5), goal)
-    if thrown is not None:
-        return tuple(np.asarray(x, float).reshape(-1, 3) for x in thrown)
-    return balls_above(env.ball_init_pos, env.num_balls), np.zeros((env.num_balls, 3))
-
-
-class Robot:
-    """An arm with a paddle, balls and a camera in the C engine; somebody holds the balls until the
-    episode starts."""
-
-    def __init__(self, name: str, seed: int = 0):
-        shared_model, env = _model(name)
-        self.name = name
-        self.engine = CEngine(shared_model)
-        self.model = self.engine.model
-        self.data = mujoco.MjData(self.model)
-        self.random = np.random.default_rng(seed)
-        self.sensors = REAL if env.randomization.ball_latency else PERFECT
-        addresses = find_addresses(self.model)
-        self.qpos = list(addresses.arm_qpos)
-        self.qvel = list(addresses.arm_qvel)
-        self.servos = list(addresses.actuators)
-        self.paddle_geom = addresses.paddle_geom
-        self.balls = addresses.balls
-        self.home = np.array(env.default_joint_angles)
-        self.data.qpos[self.qpos] = self.home
-        self.is_held = True
-        self.is_dead = np.zeros(len(self.home), bool)
-        self.command_delay = 0.0
-        """From a command to the servos, s."""
-        self.sent: deque[tuple[float, np.ndarray]] = deque()
-        self.command = self.home.copy()
-        self.pictures: deque[tuple[float, np.ndarray]] = deque()
-        """That the program has not yet, with the times at which they were taken, s."""
-        self.newest: tuple[float, np.ndarray] | None = None
-        self.before: tuple[float, np.ndarray] | None = None
-        self.hold()
-        mujoco.mj_forward(self.model, self.data)
-
-    def hold(self) -> None:
-        """Puts the balls at their start."""
-        for ball, place in zip(self.balls, _throw_of(self.name)[0], strict=True):
-            self.data.qpos[list(ball.qpos)] = [*place, 1.0, 0.0, 0.0, 0.0]
-            self.data.qvel[list(ball.qvel)] = 0.0
-
-    def release(self) -> None:
-        """Throws the balls as the task does."""
-        for ball, velocity in zip(self.balls, _throw_of(self.name)[1], strict=True):
-            self.data.qvel[list(ball.qvel[:3])] = velocity
-        self.is_held = False
-
-    @property
-    def angles(self) -> np.ndarray:
-        return self.data.qpos[self.qpos].copy()
-
-    @property
-    def paddle(self) -> np.ndarray:
-        return self.data.geom_xpos[self.paddle_geom].copy()
-
-    @property
-    def picture_time(self) -> float:
-        return self.newest[0]
-
-    @property
-    def picture_noise(self) -> float:
-        return self.sensors.noise
-
-    def measure(self) -> dict[str, Any]:
-        """What the robot's program knows."""
-        time = self.data.time
-        while self.pictures and self.pictures[0][0] <= time - self.sensors.delay + 1e-9:
-            self.before = self.newest
-            self.newest = self.pictures.popleft()
-        angle_noise, velocity_noise = self.random.standard_normal((2, len(self.home)))
-        angle_noise = self.sensors.angle_noise * angle_noise
-        velocity_noise = 100.0 * self.sensors.angle_noise * velocity_noise
-        measured = {
-            "joint_angles": self.angles + angle_noise,
-            "joint_velocities": self.data.qvel[self.qvel] + velocity_noise,
-            "time": time,
-        }
-        if self.newest is not None:
-            taken, places = self.newest
-            earlier, places_before = self.before or self.newest
-            velocity = (places - places_before) / max(taken - earlier, 1e-3)
-            if self.sensors == PERFECT:
-                rows = [self.data.qvel[list(ball.qvel[:3])] for ball in self.balls]
-                velocity = np.squeeze(rows)
-            measured |= {"ball_position": places.copy(), "ball_velocity": velocity}
-            measured["ball_age"] = time - taken
-        return measured
-
-    def step(self, commands: np.ndarray) -> None:
-        """The control step of commands [M, J]."""
-        for command in commands:
-            self.sent.append((self.data.time + self.command_delay, np.array(command)))
-            for _ in range(round(1.0 / (RATE * self.model.opt.timestep))):
-                while self.sent and self.sent[0][0] <= self.data.time + 1e-9:
-                    self.command = self.sent.popleft()[1]
-                self.data.ctrl[self.servos] = np.where(self.is_dead, self.angles, self.command)
-                if self.is_held:
-                    self.hold()
-                self.engine.step(self.data)
-                self._look()
-
-    def _look(self) -> None:
-        last_picture = self.pictures[-1] if self.pictures else self.newest
-        last_time = -1.0 if last_picture is None else last_picture[0]
-        if self.data.time - last_time > 1.0 / self.sensors.rate - 1e-9:
-            places = np.array([self.data.qpos[list(ball.qpos[:3])] for ball in self.balls])
-            noise = self.sensors.noise * self.random.standard_normal(places.shape)
-            self.pictures.append((self.data.time, np.squeeze(places + noise)))
+def simulated_arm(name: str, seed: int = 0) -> SimulatedArm:
+    """The arm of a policy, with a camera and encoders that are as good as in its training."""
+    config = _config(name)
+    world = REAL if config.randomization.ball_latency else PERFECT
+    return SimulatedArm(config, world, seed, rate=RATE)
 
 
 class Fault(NamedTuple):
@@ -213,6 +93,10 @@ class Fault(NamedTuple):
     nothing stops."""
     within: float = 0.3
     """Time to the start of the braking, s."""
+    by_torque: bool = False
+    """Whether it shows only once a joint needs torque, and is off its command: the time counts from
+    then on. One that is not asked to move needs none, nor does an arm that swings downward until it
+    is to brake."""
     steps: float = math.inf
     """Control steps in a row in which it is there."""
     from_start: bool = False
@@ -223,6 +107,8 @@ class Fault(NamedTuple):
     """What the robot gets in place of the commands [M, J]."""
     falls: bool = False
     """Whether no command can keep the arm in the box."""
+    least_way: float = 0.0
+    """Way of a joint in 0.1 s that shows it, rad; without one, nothing has to stop."""
 
 
 def _at_rest(moment: Moment, commands: np.ndarray) -> np.ndarray:
@@ -253,9 +139,20 @@ def _velocities(change: Callable[[np.ndarray], np.ndarray]) -> Act:
     return inject.put("joint_velocities", lambda m: change(m.measured["joint_velocities"]))
 
 
-def _second_ball(moment: Moment) -> None:
-    if round(moment.arm.picture_time * moment.arm.sensors.rate) % 2 == 0:
-        moment.measured["ball_position"] = moment.measured["ball_position"] + [0.0, 0.1, 0.0]
+def _second_ball() -> Act:
+    """Every second picture that the program sees shows another ball."""
+    seen: list[float] = []
+
+    def act(moment: Moment) -> None:
+        if moment.time == 0.0:
+            seen.clear()
+        taken = moment.arm.picture_time
+        if taken not in seen[-1:]:
+            seen.append(taken)
+        if len(seen) % 2:
+            moment.measured["ball_position"] = moment.measured["ball_position"] + [0.0, 0.1, 0.0]
+
+    return act
 
 
 ARM = ("joint_astray",)
@@ -266,12 +163,21 @@ FLIGHT = ("ball_flight", "ball_lost")
 """Codes for a ball that does not fly as balls do."""
 HELD = ("ball_flight",)
 SPEED = ("joint_speed",)
+ALIKE = 0.2
+"""Difference of two joints at home, rad, that the room for a start hides."""
+VELOCITY_WAY = 0.02
+"""Way of a joint in 0.1 s, rad, that tells its velocity from another one, by the noise: on a slower
+arm, such as that of `balance`, a wrong velocity is within it."""
 WAITS = ("waits", "joint_range")
 """Codes for an arm that is not known to rest where it is measured: nothing is sent."""
 
 
 def faults(joints: int, policy: str = "robust") -> dict[str, Fault]:
     """The faults of an arm with a number of joints under a policy, by name."""
+    metadata = load_policy(policy).metadata
+    home = metadata.default_joint_angles
+    # Joints that look alike at home are told apart when they move.
+    alike = ARM if abs(home[1] - home[2]) < ALIKE else ()
     found = {"nothing": Fault(_nothing)}
     for joint in (0, 1, 2, joints - 1):
         name = f"joint {joint + 1}"
@@ -283,7 +189,7 @@ def faults(joints: int, policy: str = "robust") -> dict[str, Fault]:
             inject.drift(joint, 0.5), (*ARM, *SPEED, "box")
         )
         found[f"{name}: encoder is frozen"] = Fault(inject.frozen_encoder(joint), ARM, 0.5)
-        found[f"{name}: servo without torque"] = Fault(inject.dead(joint), ARM, 0.5)
+        found[f"{name}: servo without torque"] = Fault(inject.dead(joint), ARM, 0.5, by_torque=True)
     for joint in (1, 2):
         found[f"joint {joint + 1}: sign flips"] = Fault(inject.flipped(joint), JUMP)
     zeros = inject.put("joint_angles", lambda m: 0.0 * m.measured["joint_angles"])
@@ -294,7 +200,9 @@ def faults(joints: int, policy: str = "robust") -> dict[str, Fault]:
         ),
         "joint 1 and 2 swapped": Fault(inject.swapped(0, 1), (*JUMP, *ARM)),
         "joint 2 and 3 swapped": Fault(inject.swapped(1, 2), (*JUMP, *ARM)),
-        "joint 2 and 3 swapped from the start": Fault(inject.swapped(1, 2), WAITS, from_start=True),
+        "joint 2 and 3 swapped from the start": Fault(
+            inject.swapped(1, 2), (*WAITS, *alike), from_start=True
+        ),
         "joint 2 with another sign from the start": Fault(
             inject.flipped(1), WAITS, from_start=True
         ),
@@ -306,10 +214,18 @@ def faults(joints: int, policy: str = "robust") -> dict[str, Fault]:
             _copied_target, WAITS, from_start=True
         ),
         "zeros of three joints in every second sample": Fault(_every_second, JUMP),
-        "joint velocities: zero": Fault(_velocities(lambda v: 0.0 * v), SPEED, 0.5),
-        "joint velocities: reversed": Fault(_velocities(lambda v: -v), SPEED, 0.5),
-        "joint velocities: permuted": Fault(_velocities(lambda v: np.roll(v, 1)), SPEED, 0.5),
-        "joint velocities: rpm": Fault(_velocities(lambda v: 9.55 * v), SPEED, 0.5),
+        "joint velocities: zero": Fault(
+            _velocities(lambda v: 0.0 * v), SPEED, 0.5, least_way=VELOCITY_WAY
+        ),
+        "joint velocities: reversed": Fault(
+            _velocities(lambda v: -v), SPEED, 0.5, least_way=VELOCITY_WAY
+        ),
+        "joint velocities: permuted": Fault(
+            _velocities(lambda v: np.roll(v, 1)), SPEED, 0.5, least_way=VELOCITY_WAY
+        ),
+        "joint velocities: rpm": Fault(
+            _velocities(lambda v: 9.55 * v), SPEED, 0.5, least_way=VELOCITY_WAY
+        ),
         "all joints: degrees": Fault(
             inject.put("joint_angles", lambda m: np.degrees(m.measured["joint_angles"])), JUMP
         ),
@@ -339,7 +255,7 @@ def faults(joints: int, policy: str = "robust") -> dict[str, Fault]:
             ("measurement",),
         ),
         "all joints: missing": Fault(lambda m: m.measured.pop("joint_angles"), ("measurement",)),
-        "torque of 3 N m": Fault(inject.weak(3.0), ARM, falls=True),
+        "torque of 3 N m": Fault(inject.weak(3.0), ARM, by_torque=True, falls=True),
         "the arm ignores its commands": Fault(_nothing, ARM, sent=_at_rest),
         "commands 0.5 s late": Fault(inject.late_commands, (*ARM, "ball_lost", "box"), 0.5),
         "time stands": Fault(inject.frozen("time"), ("time",)),
@@ -379,7 +295,7 @@ def faults(joints: int, policy: str = "robust") -> dict[str, Fault]:
         "ball: a camera is bumped by 5 cm": Fault(
             inject.ball(lambda m, x: x + [0.0, 0.05, 0.0]), ("", *FLIGHT, "box"), math.inf
         ),
-        "ball: a second one 0.1 m aside in every second picture": Fault(_second_ball, FLIGHT),
+        "ball: a second one 0.1 m aside in every second picture": Fault(_second_ball(), FLIGHT),
         "ball: held 0.4 m beside": Fault(inject.held([0.0, 0.4, 0.1]), FLIGHT),
         "ball: held 0.3 m above": Fault(inject.held([0.0, 0.0, 0.3]), FLIGHT),
         "ball: carried at 0.3 m/s": Fault(inject.held([0.0, 0.4, 0.1], speed=0.3), FLIGHT),
@@ -397,7 +313,7 @@ def faults(joints: int, policy: str = "robust") -> dict[str, Fault]:
             ("joint_speed",),
         ),
     }
-    if load_policy(policy).metadata.ball_rests is not False:
+    if metadata.ball_rests is not False:
         # A hand near the paddle, and one that takes the ball off it, are no faults there.
         found["ball: held 3 cm above"] = Fault(inject.held([0.0, 0.0, 0.05]), ("", *HELD), math.inf)
     return found
@@ -426,6 +342,10 @@ class Outcome(NamedTuple):
     """Of the arm from the box, m."""
     waits_for: str = ""
     """Why nothing was sent; empty if anything was."""
+    off_after: float = math.inf
+    """From the fault to the first joint that is `SHOWN` off its command, s."""
+    way: float = math.inf
+    """Largest one of a joint in 0.1 s while the fault was there, rad."""
 
     def wrong(self, fault: Fault) -> str:
         """What is wrong with the outcome of a fault; empty if nothing is."""
@@ -441,16 +361,21 @@ class Outcome(NamedTuple):
             return f"commands {self.outside:.3g} m and the arm {self.arm_outside:.3g} m outside"
         if not fault.codes:
             return f"stopped as {self.reason}" if self.fault else ""
+        if not self.fault and self.way < fault.least_way:
+            return ""
         if self.fault not in fault.codes:
             return f"{self.fault or 'nothing'} in place of {', '.join(fault.codes)}: {self.reason}"
-        if self.fault and not fault.from_start and not 0.0 <= self.braking_after <= fault.within:
+        shown_after = min(self.off_after, self.braking_after) if fault.by_torque else 0.0
+        latest = shown_after + fault.within
+        if self.fault and not fault.from_start and not 0.0 <= self.braking_after <= latest:
             return f"braking begins after {self.braking_after:.2f} s"
         return ""
 
 
 def run(name: str, fault: Fault, seed: int = 0) -> Outcome:
     """One run of a policy with a fault."""
-    robot = Robot(name, seed)
+    robot = simulated_arm(name, seed)
+    operator = SimulatedOperator(robot)
     policy = load_policy(name)
     metadata = policy.metadata
     home = paddle_position(metadata, robot.home)
@@ -461,15 +386,18 @@ def run(name: str, fault: Fault, seed: int = 0) -> Outcome:
     """Of the control steps."""
     commanded: list[np.ndarray] = []
     paddles: list[np.ndarray] = []
+    angles: list[np.ndarray] = []
+    """Of the arm in the control steps with the fault."""
     started: float | None = None
     first_measured: dict[str, Any] = {}
     fault_steps = 0
     code = reason = ""
     braking_after = math.nan
+    off_after = math.inf
     first_distance = 0.0
     commands = np.zeros((0, len(robot.home)))
     while robot.data.time < (started or 1.0) + SECONDS:
-        measured = robot.measure() | wished
+        measured = robot.read() | wished
         fault_time = _time_since_fault(fault, robot.data.time, started, fault_at)
         is_there = fault_time >= 0.0 and fault_steps < fault.steps
         if is_there:
@@ -498,16 +426,20 @@ def run(name: str, fault: Fault, seed: int = 0) -> Outcome:
                 first_distance = float(np.max(np.abs(commands - robot.angles)))
             last_commands.append(commands[-1])
             commanded.extend(commands)
-        if arm.state == "ready" and robot.newest is not None:
+        state = arm.state
+        if operator.has_word(state) and state == "ready" and "ball_position" in measured:
             arm.start()
             started = robot.data.time
-            robot.release()
         sent = commands
         if not len(sent):
             sent = np.tile(robot.command, (policy.commands_per_step(RATE), 1))
         if is_there and fault.sent is not None:
             sent = fault.sent(moment, sent)
-        robot.step(sent)
+        robot.send(sent)
+        if is_there:
+            angles.append(robot.angles)
+            if np.max(np.abs(robot.angles - robot.command)) > SHOWN:
+                off_after = min(off_after, fault_time)
         if started is not None:
             paddles.append(robot.paddle)
         if arm.state == "stopped" and fault_time > 1.0:
@@ -528,7 +460,16 @@ def run(name: str, fault: Fault, seed: int = 0) -> Outcome:
         outside=outside(paddle_position(metadata, np.array(commanded))) if commanded else -BOX,
         arm_outside=outside(np.array(paddles)),
         waits_for="" if last_commands else arm.reason or "",
+        off_after=off_after,
+        way=_way(np.array(angles), round(0.1 / metadata.control_dt)),
     )
+
+
+def _way(angles: np.ndarray, steps: int) -> float:
+    """The largest way of a joint by its angles [N, J] in a number of control steps, rad."""
+    if len(angles) <= steps:
+        return math.inf
+    return float(np.max(np.abs(angles[steps:] - angles[:-steps])))
 
 
 def _time_since_fault(fault: Fault, time: float, started: float | None, fault_at: float) -> float:

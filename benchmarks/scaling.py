@@ -87,7 +87,7 @@ def programs(configs: list[TrainConfig]) -> list[Callable[[], object]]:
 
     for trainer in trainers:
         trainer.start()
-        trainer.run()
+        trainer.train_block()
     return [trainer.run for trainer in trainers]
 
 

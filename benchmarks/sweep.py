@@ -189,7 +189,6 @@ def main() -> None:
                 "pip install 'bounce_mjx[sweep]'"
             )
         base = read_preset(command.config)
-        base.check_eval_seed()
         set_up_jax(base.env)
         study = search(command, base)
         device = device_name()

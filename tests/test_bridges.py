@@ -348,7 +348,7 @@ def test_a_ur_bridge_sends_nothing_to_another_robot(robot, parked) -> None:
         # Without a picture of the ball, no word starts an episode.
         assert not session.episodes and "there is no picture of the ball" in session.reason
     else:
-        assert not sent and session.fault == "joint_astray"
+        assert not sent and session.fault == "tool"
         assert "check that the policy is of this arm" in session.reason
 
 

@@ -14,13 +14,14 @@ import bounce_mjx
 from bounce_mjx.commands import eval as eval_command
 from bounce_mjx.commands.main import main as console_script
 from bounce_mjx.commands.play import PlayCommand
+from bounce_mjx.commands.train import fields_of_command
 from bounce_mjx.commands.which_policy import film_command
 from bounce_mjx.config.command_line import flags_of, parse
 from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.folders import choose_checkpoint
-from bounce_mjx.runs.layers import Choice, read_layers, read_preset
-from bounce_mjx.training.command import fields_of_command
+from bounce_mjx.runs.layers import read_preset
+from bounce_mjx.runs.start import StartFlags, find_start
 from bounce_mjx.viewers.simulation import Simulation
 from tiny_runs import STEPS, TINY, TRAIN_SCRIPT, shared_run
 
@@ -52,8 +53,14 @@ MISTAKES = (
     ),
     ("train --action-scale nan", "--action-scale is nan", "a finite number"),
     ("train {run} --config a.yaml", "has its config, with which it is resumed"),
-    ("train --resume b", "the run to resume is the first word: bounce-mjx train b"),
-    ("train --task=catch", "the task is the first word: bounce-mjx train catch"),
+    (
+        "train --resume b",
+        "unknown argument --resume; its value has no flag, and stands first: [TASK|POLICY|RUN]",
+    ),
+    (
+        "train --task=catch",
+        "unknown argument --task=catch; its value has no flag, and stands first: [TASK|",
+    ),
     ("train --seed 3 catch", "catch is what the training begins with; give it first"),
     ("train cach", "no task, policy or run cach; did you mean catch?"),
     ("train robust_small --warm-start robust", "are two policies; leave one out"),
@@ -65,7 +72,7 @@ MISTAKES = (
     ("eval --json nowhere/a.json", "nowhere/a.json", "make it"),
     ("evl", "unknown command evl", "did you mean eval?", "bounce-mjx --help"),
     ("--num-envs 3", "unknown command --num-envs", "choose train, eval"),
-    ("eval pretraned", "there is no checkpoint folder and no policy pretraned; did you mean"),
+    ("eval pretraned", "there is no run and no policy pretraned; did you mean"),
     ("eval miror", "no policy miror; did you mean mirror?"),
     ("export robst_small", "no policy robst_small; did you mean robust_small?"),
     ("play ur5", "no policy ur5; did you mean ur5e?"),
@@ -92,12 +99,18 @@ MISTAKES = (
     ("play robust --out a.mp4", "unknown argument --out; did you mean --video?"),
     ("report robust", "the policy robust comes with the package", "give a run's folder"),
     ("plot catch", "the policy catch comes with the package"),
-    ("play --nominal", "--nominal is of an evaluation", "add its --episode"),
-    ("play robust --suite robustness_v2 --episode 3", "--suite is that of a condition; add"),
-    ("robustness robust --world fast_servo --assumed --suite robustness_v2", "omit --suite"),
-    ("robustness robust --assumed", "--assumed needs a named world"),
+    ("play --nominal", "--nominal needs --episode; add it"),
+    (
+        "play robust --suite robustness_v2 --episode 3",
+        "--suite needs --condition; add it, or omit --suite",
+    ),
+    (
+        "robustness robust --world fast_servo --assumed --suite robustness_v2",
+        "--assumed and --suite cannot",
+    ),
+    ("robustness robust --assumed", "--assumed needs --world; add it"),
     ("play robust --condition late --episode 3", "no condition 'late'", "one such as"),
-    ("play robust --condition nominal --nominal --episode 3", "--condition is a whole world"),
+    ("play robust --condition nominal --nominal --episode 3", "--condition and --nominal cannot"),
     ("play robust --condition nominal --episode 64", "episodes 0 to 63"),
     ("play robust --episode 64 --episodes 64", "--episode is 64", "0 to 63"),
     ("play robust catch --episode 1", "one episode of one policy"),
@@ -105,12 +118,12 @@ MISTAKES = (
     ("eval mirror --robot nope", "no robot is named nope"),
     ("plot {run} --formats gif", "--formats is gif", "'png' or 'svg'"),
     ("plot {run} --out {run}/config.yaml", "cannot be written", "--out"),
-    ("train --eval-seed 20000", "eval_seed is 20000, the seed of bounce-mjx eval,", "give another"),
+    ("train --eval-seed 20000", "eval_seed: 20000 is the seed of bounce-mjx eval,", "give another"),
     ("train --warm-start robust", "without its value network; give robust_small"),
     ("train --warm-start robust_small --hidden-layers 8", "other hidden layers"),
     ("train --warm-start robust_small --observation.action 1", "another observation"),
-    ("train --warm-start robust_small --robot ur5e", "a warm start and a robot cannot be"),
-    ("train --warm-start nowhere", "there is no checkpoint folder nowhere; give a run"),
+    ("train --warm-start robust_small --robot ur5e", "the robot ur5e is given, and a policy"),
+    ("train --warm-start nowhere", "there is no run and no policy nowhere; give a run"),
     ("train {run} --warm-start robust_small", "has its warm_start", "--warm-start {run}"),
     ("train {run} --reward.height.weight 1", "cannot change env.reward.height.weight;"),
     ("train {run} --block-steps 128", "cannot change block_steps;", "leave those out"),
@@ -248,7 +261,7 @@ def test_the_help_of_a_training_is_one_screen_and_the_whole_help_has_every_flag(
     assert "--num-envs INT          Environments that run in parallel (default: 512)" in pages[0]
     shown = {*re.findall(r"^  (--[\w.-]+)", pages[1], re.MULTILINE)}
     shown |= {*re.findall(r"^  --.+, (--no-[\w.-]+)", pages[1], re.MULTILINE)}
-    known = {*flags_of(fields_of_command(read_layers(Choice())))}
+    known = {*flags_of(fields_of_command(find_start(None, StartFlags())))}
     assert shown == known
     assert pages[1].index("\nppo:\n") < pages[1].index("--learning-rate FLOAT")
 
@@ -352,4 +365,4 @@ def test_a_mistyped_run_is_told_before_what_draws_is_imported(
 ) -> None:
     for module in ("reports.figures", "reports.page", "viewers.page"):
         monkeypatch.setitem(sys.modules, f"bounce_mjx.{module}", None)
-    refused(f"{command} nowhere", "there is no checkpoint folder nowhere; give a run's folder")
+    refused(f"{command} nowhere", "there is no run and no policy nowhere; give a run's folder")

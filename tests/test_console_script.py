@@ -18,9 +18,9 @@ import yaml
 import bounce_mjx
 from bounce_mjx import lazy
 from bounce_mjx.commands import main as console_script
-from bounce_mjx.commands import train as train_command
 from bounce_mjx.errors import UserError, exit_on_user_error
 from bounce_mjx.interrupt import StopRequest
+from tiny_runs import settings_of
 
 CHECKOUT = Path(__file__).parent.parent
 
@@ -347,7 +347,7 @@ USUAL_SPELLINGS = {
 @pytest.mark.parametrize("flags", USUAL_SPELLINGS)
 def test_usual_spellings_of_flags(flags: str) -> None:
     expected, *path = USUAL_SPELLINGS[flags]
-    value = train_command.read_command(flags.split()).config
+    value = settings_of(flags.split()).config
     for name in path:
         value = getattr(value, name)
     assert value == expected

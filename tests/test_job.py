@@ -38,7 +38,8 @@ from bounce_mjx.runs.folders import (
     run_or_newest,
     stored_checkpoints,
 )
-from bounce_mjx.runs.layers import Choice, read_layers
+from bounce_mjx.runs.layers import read_layers
+from bounce_mjx.runs.start import Choice
 from bounce_mjx.training import hosts, job, saving
 from bounce_mjx.training.events import Event
 from bounce_mjx.training.faults import first_block_fault
@@ -69,7 +70,7 @@ class CountingTrainer:
     def start(self, state, networks):
         self.state = np.int32(0) if state is None else state
 
-    def run(self):
+    def train_block(self):
         names = (
             "fault",
             "episode/ended",
@@ -93,10 +94,10 @@ def before(iteration: int, act: Callable) -> type[CountingTrainer]:
     """A trainer that calls `act` before it trains an iteration."""
 
     class Acting(CountingTrainer):
-        def run(self):
+        def train_block(self):
             if self.state == iteration - 1:
                 act()
-            return super().run()
+            return super().train_block()
 
     return Acting
 
@@ -274,7 +275,7 @@ def test_an_algorithm_brings_its_own_trainer(tmp_path: Path, monkeypatch) -> Non
     run = _run_of(config, None, (), io.StringIO(), scores)
     assert (config.ppo.start_steps, config.iterations_per_block) == (8, 2)
     assert results_of(run)["best_steps"] == 128 and (run / "algorithm/counting.py").exists()
-    longer = read_layers(Choice(start=str(run))).config({"total_steps": 192})
+    longer = read_layers(Choice(word=str(run))).config({"total_steps": 192})
     _run_of(longer, run, (), io.StringIO(), scores)
     assert evaluated_steps(run) == [64, 128, 192]
     (tmp_path / "without.py").write_text(
@@ -348,7 +349,7 @@ def test_a_training_stops_once_its_results_have_a_margin(tmp_path: Path) -> None
     assert f"{run} has met all results, 192 steps; add --total-steps N" in shown.getvalue()
     # Results are not needed to resume.
     (run / "results.json").write_text("damaged")
-    layers = read_layers(Choice(start=str(run)))
+    layers = read_layers(Choice(word=str(run)))
     going_on = layers.config({"total_steps": 10**6})
     assert not going_on.stop_when_solved
     assert going_on.sources["stop_when_solved"] == going_on.sources["total_steps"] == "train"
@@ -363,15 +364,15 @@ def test_a_training_stops_once_its_results_have_a_margin(tmp_path: Path) -> None
 
 def test_settings_that_cannot_be_trained_are_refused_before_a_save(tmp_path: Path) -> None:
     class Falling(CountingTrainer):
-        def run(self):
-            return super().run() | {"episode/ended": np.full((1, 1), float(BLOCK))}
+        def train_block(self):
+            return super().train_block() | {"episode/ended": np.full((1, 1), float(BLOCK))}
 
     class OtherUnit(CountingTrainer):
         """A reward in mm for m, among terms that are in order."""
 
-        def run(self):
+        def train_block(self):
             terms = {"reward/alive": 1.0, "reward/height": -2e5}
-            return super().run() | {name: np.full((1, 1), x) for name, x in terms.items()}
+            return super().train_block() | {name: np.full((1, 1), x) for name, x in terms.items()}
 
     with pytest.raises(UserError, match="these settings cannot be trained: an episode lasts 0.01"):
         train(tmp_path, RETURNS, trainer=Falling)
@@ -380,7 +381,7 @@ def test_settings_that_cannot_be_trained_are_refused_before_a_save(tmp_path: Pat
     assert not list(tmp_path.iterdir())
     # Its scale counts.
     ppo = PPOConfig(num_envs=8, rollout_length=8, num_minibatches=2, reward_scale=0.04)
-    metrics = OtherUnit.run(OtherUnit(TrainConfig(ppo=ppo), None))
+    metrics = OtherUnit.train_block(OtherUnit(TrainConfig(ppo=ppo), None))
     assert first_block_fault(metrics, TrainConfig(ppo=ppo)) is None
 
 
@@ -575,7 +576,7 @@ def test_a_folder_that_is_moved_during_a_training_is_not_made_again(tmp_path: Pa
     moved = tmp_path / "moved"
 
     class Moved(CountingTrainer):
-        def run(self):
+        def train_block(self):
             if self.state == 1:
                 (run,) = (tmp_path / "runs").iterdir()
                 while not (run / "results.json").exists():
@@ -584,7 +585,7 @@ def test_a_folder_that_is_moved_during_a_training_is_not_made_again(tmp_path: Pa
             if self.state == 3:
                 assert not list((tmp_path / "runs").iterdir())
                 moved.rename(self.place[1])
-            return super().run()
+            return super().train_block()
 
     run = train(tmp_path / "runs", RETURNS, trainer=Moved, said=(said := io.StringIO()))
     assert "cannot be written (it was moved or removed)" in said.getvalue()
@@ -594,7 +595,7 @@ def test_a_folder_that_is_moved_during_a_training_is_not_made_again(tmp_path: Pa
 def test_a_named_checkpoint_is_the_one_that_is_resumed(tmp_path: Path) -> None:
     """What was trained after it counts no more, even if it was better."""
     run = train(tmp_path, {1: 9.0, 2: 1.0})
-    with pytest.raises(UserError, match="there is no checkpoint folder"):
+    with pytest.raises(UserError, match="there is no run and no policy"):
         train(tmp_path, RETURNS, run / "checkpoints/192")
     train(tmp_path, {1: 9.0, 2: 3.0, 3: 2.0}, run / "checkpoints/64")
     assert evaluated_steps(run) == [64, 128, 192]
@@ -689,7 +690,7 @@ def test_a_warm_start_that_meets_all_results_is_trained_until_a_margin(
 ) -> None:
     """The wait for a margin counts from a policy that was trained; one with a margin needs none."""
     networks = "networks of a warm start"
-    monkeypatch.setattr(checkpoints, "read_start", lambda config, env: networks)
+    monkeypatch.setattr(checkpoints, "read_warm_start", lambda config, env: networks)
     returns = dict.fromkeys(range(6), 1.0)
     settings = {"warm_start": Path("robust_small"), "stop_when_solved": True}
     run = train(tmp_path / "a", returns, margins={0: 0.5, 1: 0.5, 3: 1.0}, **settings)
@@ -706,7 +707,7 @@ def test_a_warm_start_that_meets_all_results_is_trained_until_a_margin(
 def test_a_signal_after_the_evaluation_of_a_warm_start_says_how_to_resume(
     tmp_path: Path, monkeypatch
 ) -> None:
-    monkeypatch.setattr(checkpoints, "read_start", lambda config, env: "networks")
+    monkeypatch.setattr(checkpoints, "read_warm_start", lambda config, env: "networks")
 
     def stop(event: Event) -> None:
         os.kill(os.getpid(), signal.SIGTERM)
@@ -895,4 +896,4 @@ def test_a_solved_run_goes_on_with_more_steps_also_beside_a_seed_that_diverged(
     settings = {"num_seeds": SEEDS, "stop_when_solved": True, "margins": {1: 1.0}}
     run = train(tmp_path, RETURNS, trainer=DivergingAtOnce, **settings)
     assert evaluated_steps(run / "seed_000") == [64]
-    assert not read_layers(Choice(start=str(run))).config({"total_steps": 10**6}).stop_when_solved
+    assert not read_layers(Choice(word=str(run))).config({"total_steps": 10**6}).stop_when_solved

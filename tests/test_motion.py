@@ -11,10 +11,11 @@ import pytest
 
 from bounce_mjx import BounceBall, EnvConfig, load_policy
 from bounce_mjx.deploy.faults import arm_responses, picture_age
-from bounce_mjx.deploy.flight import fit_fall
+from bounce_mjx.deploy.flight import begin, fit_fall, flight_bounds, follow
 from bounce_mjx.deploy.metadata import CommandLimits
 from bounce_mjx.deploy.motion import paddle_normal, paddle_position
 from bounce_mjx.deploy.policy import DeployedPolicy
+from bounce_mjx.deploy.samples import Samples, Seen
 from bounce_mjx.errors import UserError
 from bounce_mjx.physics import servo_targets
 from deployed import ball_over, changed_policy
@@ -682,6 +683,68 @@ def test_a_ball_that_a_hand_holds_stops_the_arm(
         # Beside the 30 ms of the camera.
         assert arm.fault == "ball_flight" and 0.01 * (step - began) <= within + 0.03, arm.reason
         assert "nobody holds it" in arm.reason
+
+
+@pytest.mark.parametrize(
+    ("name", "height", "fault"),
+    [("balance", 0.0225, None), ("balance", 0.3, "old_picture"), ("robust", 0.0225, "old_picture")],
+)
+def test_a_picture_that_repeats_is_old_but_of_a_ball_that_may_rest_there(
+    name: str, height: float, fault: str | None
+) -> None:
+    """Without `ball_age`, whose absence is no evidence of a camera that stands still."""
+    arm, home, seen = supervised(name)
+    paddle = paddle_position(load_policy(name).metadata, home)
+    angles = home
+    for step in range(200):
+        given = seen(angles, step) | {"ball_position": paddle + [0.0, 0.0, height]}
+        given.pop("ball_age", None)
+        given |= {key: np.zeros(3) for key in ("ball_velocity",) if key in given}
+        angles = arm.commands(given)[-1]
+        if arm.state == "ready":
+            arm.start()
+    assert arm.fault == fault, arm.reason
+
+
+def test_a_ball_that_comes_to_rest_has_no_velocity_without_ages() -> None:
+    """Of a policy that makes it from two pictures, of which the last two differed."""
+    metadata = load_policy("balance").metadata._replace(velocity="differences")
+    samples = Samples(metadata)
+    seen = samples.rest(Seen(), np.array(metadata.default_joint_angles))
+    ball = paddle_position(metadata, np.array(metadata.default_joint_angles)) + [0.0, 0.0, 0.0225]
+    pictures = []
+    for step in range(30):
+        place = ball + [1e-3 * min(step, 5), 0.0, 0.0]
+        time = np.array([0.01 * step])
+        seen, _, _ = samples.take(seen, {"time": time, "ball_position": place})
+        pictures.append((seen.picture.balls[0, 0] - ball[0], seen.picture.taken))
+    # Sooner than after 50 ms there may have been no picture.
+    assert [taken for _, taken in pictures[5:10]] == pytest.approx([0.05] * 5)
+    assert all(taken > 0.07 for _, taken in pictures[11:])
+    assert pictures[-1][1] > 0.25
+
+
+def to_and_fro(offset: float, noise: float, rate: float) -> list[str | None]:
+    """What speaks against pictures at a rate (Hz) of a ball that rests on the paddle, each second
+    one beside by an offset, m, with noise, m."""
+    rng = np.random.default_rng(0)
+    bounds = flight_bounds(load_policy("catch").metadata)
+    paddle = np.zeros(3)
+    flight = begin(0.0, np.array([0.0, 0.0, 0.0225]), paddle)
+    reasons = []
+    for number in range(1, 400):
+        ball = [offset * (number % 2), 0.0, 0.0225] + rng.normal(0.0, noise, 3)
+        flight, reason = follow(bounds, flight, number / rate, ball, paddle)
+        reasons.append(reason)
+    return reasons
+
+
+def test_two_balls_in_turn_on_a_paddle_are_no_ball_at_rest() -> None:
+    for rate in (100.0, 60.0):
+        reasons = to_and_fro(0.1, 0.003, rate)
+        assert all("to and fro" in reason for reason in reasons[8:20])
+    for noise in (0.001, 0.005, 0.008):
+        assert not any(to_and_fro(0.0, noise, 120.0))
 
 
 @pytest.mark.parametrize("rate", [100.0, 60.0, 30.0])

@@ -28,7 +28,7 @@ from bounce_mjx.runs.checkpoints import policy_shapes, read_policy, write_run
 from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.folders import latest_checkpoint
 from bounce_mjx.task import Task
-from bounce_mjx.training.command import read_command
+from tiny_runs import settings_of
 
 OBSERVATION = EnvConfig().layout
 
@@ -570,7 +570,7 @@ def test_settings_of_an_own_algorithm_are_keys(tmp_path):
     (tmp_path / "own.py").write_text(OWN)
     import_code(tmp_path / "own.py")
     flags = ["--config", "cpu", "--algorithm", "own", "--own-cost", "2"]
-    config = read_command(flags, "cpu").config
+    config = settings_of(flags, "cpu").config
     assert find_algorithm(config.algorithm)(config.ppo, BounceBall(), 100).config.own_cost == 2.0
     config = config.model_copy(update={"log_dir": tmp_path / "runs"})
     policy = jax.tree.map(lambda x: np.ones(x.shape, x.dtype), policy_shapes(config))
@@ -583,9 +583,9 @@ def test_settings_of_an_own_algorithm_are_keys(tmp_path):
         np.testing.assert_array_equal, read_policy(latest_checkpoint(run), without), policy
     )
     with pytest.raises(UserError, match=r"the algorithm own, whose code is .+/algorithm/own.py"):
-        read_command([str(run)])
+        settings_of([str(run)])
     with pytest.raises(UserError, match="there is no algorithm 'sac'; give ppo, or --import"):
-        read_command(["--algorithm", "sac"])
+        settings_of(["--algorithm", "sac"])
 
 
 def test_the_first_state_needs_no_lapack(trainer):

@@ -9,7 +9,6 @@ import pydantic
 import pytest
 
 from bounce_mjx import load_policy
-from bounce_mjx.commands.train import read_command
 from bounce_mjx.deploy.export import export_onnx
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.config import EvaluationOptions
@@ -29,6 +28,7 @@ from bounce_mjx.runs.folders import (
 from bounce_mjx.runs.layers import read_preset
 from bounce_mjx.runs.worlds import env_in_world
 from bounce_mjx.task.registry import find_task
+from tiny_runs import settings_of
 
 FOLDER = resource_path("pretrained")
 LOG_DIR = TrainConfig().log_dir
@@ -139,7 +139,7 @@ def test_its_training_command_gives_its_config(shipped: dict, monkeypatch) -> No
     monkeypatch.chdir(FOLDER.parent)
     python, script, *flags = shipped["command"].split()
     assert (python, script) == ("python", "train_jax.py")
-    command = read_command(flags)
+    command = settings_of(flags)
     config = read_preset(FOLDER / "config.yaml")
     assert (command.config.env, command.config.ppo, command.config.seed) == (
         config.env,

@@ -18,11 +18,17 @@ from bounce_mjx.deploy.session import play, replay
 from bounce_mjx.deploy.trajectory import Trajectory, read_trajectory
 from bounce_mjx.errors import UserError
 from bounce_mjx.identify import Topics
+from bounce_mjx.identify.arm import _own_servos
 from bounce_mjx.identify.inspection import examine
+from bounce_mjx.identify.log import Log
 from bounce_mjx.identify.reading import read_log
+from bounce_mjx.identify.servos import servos_of
+from bounce_mjx.identify.simulation import make_simulator
+from bounce_mjx.identify.unknowns import Layout
+from bounce_mjx.identify.windows import cut_enough
 from bounce_mjx.rehearsal.arm import SimulatedArm, goals_in_turn, middle, rate_of
 from bounce_mjx.rehearsal.camera import NoCamera
-from bounce_mjx.rehearsal.faults import KINDS, Injection, named_fault
+from bounce_mjx.rehearsal.faults import KINDS, Injection, frozen, named_fault
 from bounce_mjx.rehearsal.operator import SimulatedOperator
 from bounce_mjx.world.model import world_model
 
@@ -172,6 +178,36 @@ def test_an_episode_waits_for_a_ball_over_the_paddle() -> None:
     assert "and an episode starts with the ball over it" in session.reason
 
 
+class WithoutAges(SimulatedArm):
+    """Its camera gives whole millimetres, and does not say when it took a picture."""
+
+    def read(self) -> dict[str, Any]:
+        measured = super().read()
+        measured.pop("ball_age", None)
+        if "ball_position" in measured:
+            measured["ball_position"] = np.round(measured["ball_position"], 3)
+        return measured
+
+
+@pytest.mark.parametrize(
+    "name, stops, fault", [("catch", 9.0, None), ("robust", 1.5, "old_picture")]
+)
+def test_a_camera_without_ages_sees_a_ball_at_rest_and_stops_an_arm_only_when_it_stands_still(
+    name: str, stops: float, fault: str | None
+) -> None:
+    """A caught ball repeats its place after some 2 s; one that bounces does not."""
+    config = environment_config(policy=name, world="training")
+    injection = Injection(frozen("ball_position"), after=stops)
+    arm = WithoutAges(config, middle(config), injection=injection)
+    operator = SimulatedOperator(arm)
+    goals = goals_in_turn(config, {})
+    session = play(load_policy(name), arm, 4.0, operator, goals, {})
+    (episode,) = session.episodes
+    assert session.fault == fault
+    if fault is not None:
+        assert stops < episode.seconds < stops + 0.3
+
+
 def test_only_the_robust_policy_bounces_with_a_late_camera() -> None:
     outcomes = {}
     for name in ("robust", "pretrained"):
@@ -201,6 +237,38 @@ def test_the_log_of_a_motion_shows_the_worlds_delay(tmp_path, monkeypatch, capsy
     (checkup,) = examine([log], JOINTS)
     assert not checkup.faults
     assert checkup.delay == pytest.approx(0.05, abs=0.003)
+
+
+def test_a_search_begins_at_the_model_itself() -> None:
+    """The log of a rehearsal is exact: from another dry friction the search ended at servos of 26
+    times the gain. One of its candidates is the simulated arm, to a microradian."""
+    config = EnvConfig()
+    model = world_model(config, visual=False)
+    model.dof_frictionloss[:6] = [3.0, 2.0, 1.0, 0.4, 0.3, 0.2]
+    arm = SimulatedArm(config, {}, model=model, camera=NoCamera())
+    arm.put_balls_away()
+    times = np.arange(0.0, 4.0, 0.002)
+    path = 0.03 * np.sin(np.outer(times, [3.0, 4.0, 5.0, 6.0, 7.0, 8.0]))
+    targets = arm.home + path * np.minimum(times, 1.0)[:, None]
+    angles = []
+    for target in targets:
+        angles.append(arm.angles)
+        arm.send(target[None])
+    none = np.zeros(0)
+    log = Log("here", times, np.array(angles), times, targets, none, np.zeros((0, 3)), none)
+    windows = cut_enough(log, config.physics_dt)
+    layout = Layout(6, False, config.physics_dt)
+    vectors = _own_servos(layout, servos_of(model), float(np.mean(servos_of(model).delays())))
+    simulate = make_simulator(config, layout, log, windows, runs_once=True)
+    starts = np.repeat(windows.starts[None], len(vectors), axis=0)
+    predicted = simulate(vectors, starts, np.ones(starts.shape[:2], bool))
+    counts = windows.angle_weights > 0.0
+    errors = [np.abs(windows.split(rows)[0] - windows.angles)[counts] for rows in predicted]
+
+    sizes = [np.median(error, axis=0).max() for error in errors]
+    assert min(sizes) < 1e-6
+    # Another friction is seen.
+    assert max(sizes) > 1e-5
 
 
 @pytest.mark.parametrize(

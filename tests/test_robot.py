@@ -828,6 +828,49 @@ def test_a_urdf_is_called_one_and_a_missing_mesh_is_to_be_put_there(tmp_path) ->
         build_arm(tmp_path / "arm.xml", RobotConfig(site="tool"))
 
 
+def urdf(effort: float = 80.0) -> str:
+    """An arm as its manufacturer describes it in ROS: six links, and a flange that is fixed to the
+    last one; no actuators, as the format has none."""
+    axes = ("0 0 1", "0 1 0", "0 1 0", "1 0 0", "0 1 0", "1 0 0")
+    text = '<robot name="six"><link name="base"/>'
+    parent = "base"
+    for i, axis in enumerate(axes, start=1):
+        at = "0.3 0 0" if i in (3, 4) else "0 0 0.1"
+        text += (
+            f'<link name="l{i}"><inertial><origin xyz="0.1 0 0"/><mass value="{4.0 / i}"/>'
+            '<inertia ixx="0.01" iyy="0.02" izz="0.02" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+            f'<joint name="j{i}" type="revolute"><parent link="{parent}"/><child link="l{i}"/>'
+            f'<origin xyz="{at}"/><axis xyz="{axis}"/>'
+            f'<limit lower="-2.9" upper="2.9" velocity="{i}.5" effort="{effort / i}"/></joint>'
+        )
+        parent = f"l{i}"
+    return text + (
+        '<link name="flange"/><joint name="fixed" type="fixed"><parent link="l6"/>'
+        '<child link="flange"/><origin xyz="0.05 0 0" rpy="0 1.5708 0"/></joint></robot>'
+    )
+
+
+def test_a_urdf_is_adopted_with_its_efforts_and_its_velocities_are_said(tmp_path, capsys) -> None:
+    (tmp_path / "arm.urdf").write_text(urdf())
+    words = [str(tmp_path / "arm.urdf"), "--site", "flange", "--out", str(tmp_path / "arm.yaml")]
+    adopt_command.main(words)
+    printed = capsys.readouterr().out
+    assert "gave each joint an actuator within its own force limit, as the file has none" in printed
+    assert "the file's limits of velocity, 1.5, 2.5, 3.5, 4.5, 5.5, 6.5 rad/s, do not" in printed
+    settings = yaml.safe_load((tmp_path / "arm.yaml").read_text())["env"]["robot"]
+    assert settings["servo_force_limit"] == pytest.approx([80.0 / i for i in range(1, 7)])
+    # Where MuJoCo places the flange, 0.05 m from the last joint.
+    robot = RobotConfig(site="flange", paddle=PaddleConfig(position=(0.0, 0.0, 0.0)))
+    built = compile_spec(build_arm(tmp_path / "arm.urdf", robot).spec, tmp_path)
+    data = mujoco.MjData(built)
+    mujoco.mj_kinematics(built, data)
+    np.testing.assert_allclose(data.geom("blocker").xpos, [0.65, 0.0, 0.4], atol=1e-9)
+    # Without an effort, nothing tells how strong its motors are.
+    (tmp_path / "arm.urdf").write_text(urdf(effort=0.0))
+    with pytest.raises(UserError, match=r"no actuator on j1, j2, .* \(to a URDF, an effort\)"):
+        build_arm(tmp_path / "arm.urdf", robot)
+
+
 def test_adopt_knows_an_arm_by_its_lengths_and_warns_of_slow_servos(tmp_path, capsys) -> None:
     adopt_command.main([str(ur5e()), "--out", str(tmp_path / "ur5e.yaml")])
     printed = capsys.readouterr().out

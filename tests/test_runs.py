@@ -45,7 +45,7 @@ from bounce_mjx.runs.storage import to_json
 from bounce_mjx.task import Proportional
 from bounce_mjx.training import run as training_run
 from bounce_mjx.world.config import ActionConfig
-from tiny_runs import contents
+from tiny_runs import contents, settings_of
 
 CATCH = resource_path("configs/catch/cpu.yaml")
 DRIBBLE = Path(__file__).parents[1] / "examples/dribble_task.py"
@@ -119,7 +119,7 @@ def test_the_arm_of_the_newest_run_is_named(runs: Path, capsys) -> None:
 def test_latest_is_a_name_for_every_command(runs: Path, monkeypatch) -> None:
     monkeypatch.chdir(runs)
     assert run_or_newest(Path("latest"), runs) == run_or_newest(None, runs) == runs / "2026-01-02"
-    command = train_command.read_command(["latest", "--log-dir", str(runs)])
+    command = settings_of(["latest", "--log-dir", str(runs)])
     assert command.layers.start.run == runs / "2026-01-02"
     (runs / "latest").mkdir()
     assert run_or_newest(Path("latest"), runs) == Path("latest")
@@ -341,10 +341,11 @@ def test_files_of_the_user_lie_on_each_other(presets: Path) -> None:
         "--config more.yaml --config my.yaml": 0.001,
     }
     for flags, rate in orders.items():
-        command = train_command.read_command(flags.split())
-        assert command.config.ppo.learning_rate == rate and command.config.ppo.discount == 0.9
-        assert command.config.ppo.num_envs == read_preset(None).ppo.num_envs
-        cpu, named, given = preset_files(command.flags.config, command.config.task)
+        config = settings_of(flags.split()).config
+        assert config.ppo.learning_rate == rate and config.ppo.discount == 0.9
+        assert config.ppo.num_envs == read_preset(None).ppo.num_envs
+        files = train_command.read_command(flags.split()).flags.config
+        cpu, named, given = preset_files(files, config.task)
         assert (cpu, named) == (resource_path("configs/cpu.yaml"), None)
         assert " ".join(map(str, given)) == flags.replace("--config=", "").replace("--config ", "")
     (presets / "more.yaml").write_text("base: randomized")

@@ -24,7 +24,6 @@ from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.folders import latest_checkpoint
 from bounce_mjx.training import hosts, ppo_trainer
-from bounce_mjx.training.command import read_command
 from tiny_runs import STEPS, TINY, arrays, job
 
 SHARED = [*TINY, "--total-steps", str(2 * STEPS), "--no-report"]
@@ -183,7 +182,7 @@ def test_two_processes_train_as_one(alone: Path, tmp_path: Path, monkeypatch: py
     ],
 )
 def test_flags_tell_whether_there_are_other_hosts(flags: str, several: bool) -> None:
-    command = read_command(flags.split())
+    command = train_command.read_command(flags.split())
     assert command.flags.on_several_hosts == several
     assert command.flags.host_timeout == (7 if "7" in flags else 300)
 

@@ -22,11 +22,12 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.runs import presets
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.folders import create_run, find_checkpoint
-from bounce_mjx.runs.layers import Choice, read_layers, read_preset
+from bounce_mjx.runs.layers import read_layers, read_preset
+from bounce_mjx.runs.start import Choice
 from bounce_mjx.training import job
-from bounce_mjx.training.command import read_command
 from bounce_mjx.training.run import notes_on_intervals, notes_on_learning_rate, notes_on_worlds
 from test_keys import KEYS, NEEDED, WITH, other, settings
+from tiny_runs import settings_of
 
 OWN = """
 from bounce_mjx.learning.ppo import PPO, PPOConfig
@@ -117,8 +118,8 @@ def test_flag_file_and_python_are_alike_for_every_key(group: str, folder: Path) 
         # An argument of `train` is called robot, as is a group of `env`.
         short = values if "robot" in alone else alone
         configs = [
-            outcome(lambda line=line: read_command(line).config),
-            outcome(lambda: read_command(["--config", "my.yaml"]).config),
+            outcome(lambda line=line: settings_of(line).config),
+            outcome(lambda: settings_of(["--config", "my.yaml"]).config),
             outcome(lambda short=short: python(**short)),
             outcome(lambda values=values: python(**values)),
         ]
@@ -135,7 +136,7 @@ def test_a_source_wins_over_those_before_it(folder: Path) -> None:
     (folder / "a.yaml").write_text("seed: 1\neval_seed: 1\neval_episodes: 1\nnum_seeds: 1")
     (folder / "b.yaml").write_text("seed: 2\neval_seed: 2\neval_episodes: 2")
     line = "--config a.yaml --config b.yaml --world ur5e_rtde --eval-seed 3 --action-scale 0.02"
-    config = read_command([*line.split(), "--algorithm", "own"]).config
+    config = settings_of([*line.split(), "--algorithm", "own"]).config
     sources = config.sources
     values = {
         "ppo.num_envs": (512, "configs/cpu.yaml"),
@@ -191,12 +192,13 @@ def test_a_warm_start_is_alike_in_a_file(folder: Path) -> None:
     own = load_run_config(find_checkpoint("robust_small").run)
     (folder / "warm.yaml").write_text("warm_start: robust_small\nenv: {action_scale: 0.03}")
     with pytest.raises(
-        UserError, match="warm.yaml starts from robust_small; give --warm-start rob"
+        UserError,
+        match="warm.yaml is of the warm_start robust_small, .* of none; give --warm-start rob",
     ):
-        read_command(["--config", "warm.yaml"])
+        settings_of(["--config", "warm.yaml"])
     configs = [
-        read_command("--warm-start robust_small --action-scale 0.03".split()).config,
-        read_command(["robust_small", "--config", "warm.yaml"]).config,
+        settings_of("--warm-start robust_small --action-scale 0.03".split()).config,
+        settings_of(["robust_small", "--config", "warm.yaml"]).config,
         python("robust_small", action_scale=0.03),
     ]
     assert configs[0] == configs[1] == configs[2]
@@ -211,7 +213,7 @@ def test_what_is_brought_whole_has_no_part_of_a_mapping_below() -> None:
     """The environment of a policy, a whole config, and a group that Python gives."""
     own = load_run_config(find_checkpoint("robust_small").run)
     transfer = read_preset(Path("transfer"))
-    config = read_command("--config transfer --warm-start robust_small".split()).config
+    config = settings_of("--config transfer --warm-start robust_small".split()).config
     assert config.env == own.env
     assert config.sources["env.randomization.shares"] == "the warm start robust_small"
     randomization = transfer.env.randomization.model_copy(update={"shares": {"push_speed": 0.4}})
@@ -243,7 +245,7 @@ def test_a_whole_config_stands_alone_below_what_python_says() -> None:
 def test_a_file_has_the_same_defaults_wherever_it_lies(folder: Path, monkeypatch) -> None:
     """Also beside the presets, and where a folder has a preset's name."""
     (folder / "cpu").mkdir()
-    assert read_command(["--config", "cpu"]).config == read_preset(None)
+    assert settings_of(["--config", "cpu"]).config == read_preset(None)
     (folder / "configs").mkdir()
     real = presets.resource_path
     of_folder = lambda name: folder / name if name == "configs" else real(name)  # noqa: E731
@@ -316,7 +318,10 @@ def test_a_mistake_names_the_layer_that_has_it(folder: Path, refused) -> None:
     (folder / "dots.yaml").write_text("reward.height.weight: 1")
     refused("train --config dots.yaml", "nest it: env: {reward: {height: {weight: ...}}}")
     (folder / "d.yaml").write_text("warm_start: no")
-    refused("train --config d.yaml", "error: d.yaml starts from False; give --warm-start")
+    refused(
+        "train --config d.yaml",
+        "error: d.yaml is of the warm_start False, and this training of none; give --warm-start",
+    )
     (folder / "e.yaml").write_text("log_dir: 5")
     refused("train --config e.yaml", "error: e.yaml: log_dir is 5, but must be a path")
 
@@ -332,7 +337,7 @@ def test_a_key_that_is_no_text_is_refused(key: str, folder: Path, refused) -> No
 
 def test_a_mapping_on_the_command_line_is_whole(folder: Path, refused) -> None:
     """No word vanishes, and None ends the mapping of a layer below."""
-    config = read_command("--config robust_small --randomization.shares None".split()).config
+    config = settings_of("--config robust_small --randomization.shares None".split()).config
     assert config.env.randomization.shares is None
     assert config.sources["env.randomization.shares"] == "flags"
     for shares in ("", "restitution", "restitution 0.5 gravity"):
@@ -342,17 +347,17 @@ def test_a_mapping_on_the_command_line_is_whole(folder: Path, refused) -> None:
 
 def test_the_command_line_takes_the_words_of_a_file_for_null_and_small_numbers() -> None:
     for word in ("null", "None"):
-        config = read_command(["--eval-every", "3", "--save-every", word]).config
+        config = settings_of(["--eval-every", "3", "--save-every", word]).config
         assert config.save_every is None and config.sources["save_every"] == "flags"
     angles = "--default-joint-angles 0 -1e-3 -.5E+0 -2.e-5 0 -0.1".split()
-    assert read_command(angles).config.env.default_joint_angles == (0, -1e-3, -0.5, -2e-5, 0, -0.1)
+    assert settings_of(angles).config.env.default_joint_angles == (0, -1e-3, -0.5, -2e-5, 0, -0.1)
 
 
 def test_the_source_is_what_set_the_value_that_counts(folder: Path) -> None:
     """A policy brings its task; a world ends a curriculum that it has no use for."""
-    config = read_command("--config finetune --warm-start track".split()).config
+    config = settings_of("--config finetune --warm-start track".split()).config
     assert (config.task, config.sources["task"]) == ("track", "the warm start track")
-    config = read_command("track --warm-start track".split()).config
+    config = settings_of("track --warm-start track".split()).config
     assert config.sources["task"] == "flags"
     (folder / "world.yaml").write_text(
         "env: {randomization: {goal_interval: [2.0, 4.0]}}\nsources: {randomization: A test.}"
@@ -362,9 +367,9 @@ def test_the_source_is_what_set_the_value_that_counts(folder: Path) -> None:
         "env: {randomization: {push_speed: [0.1, 0.1], shares: {push_speed: 0.5}}}"
     )
     line = "--config robust_small --config shares.yaml --randomization.shares action_latency 0.5"
-    config = read_command(line.split()).config
+    config = settings_of(line.split()).config
     assert config.sources["env.randomization.shares"] == "flags"
-    config = read_command("--config transfer --world world.yaml".split()).config
+    config = settings_of("--config transfer --world world.yaml".split()).config
     for key in ("share", "warmup_steps"):
         default = type(config.env.randomization).model_fields[key].default
         assert getattr(config.env.randomization, key) == default
@@ -415,9 +420,9 @@ def test_the_printed_config_is_a_config_where_a_run_is_chosen(folder: Path, caps
     line = "--warm-start latest --log-dir runs".split()
     main(["train", *line, "--print-config"])
     (folder / "again.yaml").write_text(capsys.readouterr().out)
-    assert "using the newest run: runs/2026-01-01" in read_command(line).layers.notes[0]
+    assert "using the newest run: runs/2026-01-01" in settings_of(line).layers.notes[0]
     line = ["--warm-start", str(policy.run), "--config", "again.yaml"]
-    assert read_command(line).config.ppo.hidden_layers == (128, 128)
+    assert settings_of(line).config.ppo.hidden_layers == (128, 128)
 
 
 def test_the_printed_config_is_a_config_and_says_its_sources(folder: Path) -> None:
@@ -431,8 +436,8 @@ def test_the_printed_config_is_a_config_and_says_its_sources(folder: Path) -> No
     assert lines["num_envs"].split() == ["num_envs:", "512", "#", "configs/cpu.yaml"]
     assert lines["num_seeds"].split() == ["num_seeds:", "1", "#", "default"]
     (folder / "again.yaml").write_text(said.getvalue())
-    again = read_command(["--config", "again.yaml"]).config
-    assert again == read_command(said_by_user).config
+    again = settings_of(["--config", "again.yaml"]).config
+    assert again == settings_of(said_by_user).config
 
 
 def test_the_real_intervals_are_printed_where_they_differ(folder: Path, capsys) -> None:
@@ -442,7 +447,7 @@ def test_the_real_intervals_are_printed_where_they_differ(folder: Path, capsys) 
     lines = {x.partition(":")[0].strip(): x for x in capsys.readouterr().out.splitlines()}
     assert lines["save_every"].split("# ")[1] == "flags; in whole blocks 1,048,576"
     assert lines["eval_every"].split("# ")[1] == "flags"
-    config = read_command("--config default --save-every 1e5".split()).config
+    config = settings_of("--config default --save-every 1e5".split()).config
     (note,) = notes_on_intervals(config)
     assert note.startswith("save_every 100,000 is shorter than a block, so it is done every 1,048,")
 
@@ -454,7 +459,7 @@ def test_what_a_file_cannot_say_is_told(folder: Path, refused) -> None:
     (folder / "my.yaml").write_text("task: null")
     refused(line, "my.yaml: task is None, but must be a name")
     (folder / "run").mkdir()
-    refused("train run --log-dir typo", "log_dir is where the newest run is looked for")
+    refused("train run --log-dir typo", "--log-dir is where the newest run is looked for")
 
 
 def test_no_setting_of_a_task_takes_a_flag_of_the_algorithms(folder: Path) -> None:
@@ -467,4 +472,4 @@ def test_no_setting_of_a_task_takes_a_flag_of_the_algorithms(folder: Path) -> No
     (folder / "own.py").write_text(text, encoding="utf-8")
     import_code("own.py")
     with pytest.raises(UserError, match="env.num_envs and ppo.num_envs have the same name; give"):
-        read_command(["numbered", "--config", "cpu", "--num-envs", "8"])
+        settings_of(["numbered", "--config", "cpu", "--num-envs", "8"])

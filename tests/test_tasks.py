@@ -17,6 +17,7 @@ import pytest
 
 import rest_task
 from bounce_mjx import load_policy, task
+from bounce_mjx.commands import train as train_command
 from bounce_mjx.commands.eval import EvalCommand
 from bounce_mjx.commands.goals import parse_with_goals
 from bounce_mjx.commands.main import main
@@ -36,10 +37,9 @@ from bounce_mjx.runs.layers import read_preset
 from bounce_mjx.runs.storage import seal
 from bounce_mjx.task import paths, registry
 from bounce_mjx.task.registry import find_task, task_name
-from bounce_mjx.training.command import read_command
 from bounce_mjx.world.observation import ObservationLayout, Part
 from bounce_mjx.world.sensing import Sensing
-from tiny_runs import TINY
+from tiny_runs import TINY, settings_of
 
 CHECKOUT = Path(__file__).parent.parent
 
@@ -899,18 +899,16 @@ def test_a_checkpoint_does_not_bring_code_into_a_run_without(mine: Path, tmp_pat
 def test_another_file_than_the_runs_is_told(
     mine: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from bounce_mjx.training.command import read_command
-
     import_code(mine)
     config = read_preset(None, task="dribble").model_copy(update={"log_dir": tmp_path})
     run_folder = create_run(config)
-    assert read_command([str(run_folder)]).config.env == config.env
+    assert settings_of([str(run_folder)]).config.env == config.env
     changed = tmp_path / "changed.py"
     changed.write_text(mine.read_text().replace("weight: float = 4.0", "weight: float = 5.0"))
     user_code._code_files.clear()
     import_code(changed)
     with pytest.raises(UserError, match=r"cannot be resumed with another task than it was trained"):
-        read_command([str(run_folder)])
+        settings_of([str(run_folder)])
     assert load_run_config(run_folder).env.reward.apex.weight == 4.0
     assert "changed.py differs from the task that" in capsys.readouterr().err
 
@@ -934,7 +932,7 @@ def test_a_config_file_cannot_name_code(mine: Path, tmp_path: Path) -> None:
     path = tmp_path / "config.yaml"
     path.write_text("task: dribble\nenv: {apex_range: [0.06, 0.07]}\n")
     with pytest.raises(UserError, match="is of the task dribble, and this training of bounce"):
-        read_command(["--config", str(path)])
+        settings_of(["--config", str(path)])
     with pytest.raises(UserError, match="no task, policy or run dribble; .*--import FILE.py for a"):
         read_preset(path)
     import_code(mine)
@@ -1060,9 +1058,10 @@ def test_a_task_may_name_a_goal_or_a_setting_like_a_flag(
     assert command.episodes == 7
     assert given.checked(env) == {"episodes": 0.5, "model_config": 1.0, "size": 0.1}
     flags = "--no-report --env.report 0.25 --seed 8 --env.seed 9".split()
-    command = read_command(["sized", *flags])
-    assert (command.flags.report, command.config.seed) == (False, 8)
-    assert (command.config.env.report, command.config.env.seed) == (0.25, 9)
+    command = train_command.read_command(["sized", *flags])
+    config = command.settings().config
+    assert (command.flags.report, config.seed) == (False, 8)
+    assert (config.env.report, config.env.seed) == (0.25, 9)
 
 
 class _Rising(rest_task.Rest):

@@ -21,12 +21,12 @@ from bounce_mjx.runs.checkpoints import (
     POLICY,
     read_networks,
     read_policy,
-    read_start,
+    read_warm_start,
     save_checkpoint,
 )
 from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.folders import best_checkpoint, create_run, find_checkpoint
-from tiny_runs import STEPS, TINY
+from tiny_runs import STEPS, TINY, settings_of
 
 CRITIC = {"n_bounces", "world/restitution", "world/air_drag"}
 WORLD = {
@@ -64,12 +64,12 @@ def test_the_value_network_keeps_the_terms_of_both_worlds_and_is_blind_to_new_on
     world = tmp_path / "world.yaml"
     world.write_text(yaml.safe_dump(WORLD))
     args = ["--warm-start", str(first), "--world", str(world), "--config", "cpu"]
-    command = train_command.read_command(args).config
+    command = settings_of(args).config
     assert command.ppo.critic_metrics == ("n_bounces", "world/*")
     env = Env(command.env)
     names = names_of_critic_metrics(command.ppo, env)
     assert set(names) == {"n_bounces", "world/restitution", "world/action_latency"}
-    start, seen = read_start(command, env)
+    start, seen = read_warm_start(command, env)
     size = command.env.layout.size
     of_first = jax.random.normal(jax.random.PRNGKey(2), (16, size + len(CRITIC)))
     # The term that is gone has its mean.
@@ -106,10 +106,10 @@ def test_a_training_starts_with_the_policy_of_the_run(first: Path, tmp_path: Pat
 
 def test_the_small_robust_policy_can_be_trained_further() -> None:
     args = "--warm-start robust_small --config finetune --world fast_servo".split()
-    command = train_command.read_command(args).config
+    command = settings_of(args).config
     assert str(command.warm_start) == "robust_small"
     assert command.env.randomization.terms and command.env.randomization.share == 1.0
-    params, _ = read_start(command, Env(command.env))
+    params, _ = read_warm_start(command, Env(command.env))
     checkpoint = find_checkpoint("robust_small")
     own = read_policy(checkpoint, load_run_config(checkpoint.run))
     jax.tree.map(np.testing.assert_array_equal, params.policy, own.params)
@@ -127,9 +127,11 @@ def test_networks_of_an_own_algorithm_are_no_warm_start(tmp_path: Path) -> None:
     (tmp_path / "own.py").write_text(OWN_NETWORKS)
     import_code(tmp_path / "own.py")
     flags = [*TINY, "--log-dir", str(tmp_path / "runs"), "--algorithm", "own"]
-    config = train_command.read_command(flags).config
+    config = settings_of(flags).config
     with pytest.raises(UserError, match="Own makes networks of its own, which --warm-start cannot"):
-        read_start(config.model_copy(update={"warm_start": Path("robust_small")}), Env(config.env))
+        read_warm_start(
+            config.model_copy(update={"warm_start": Path("robust_small")}), Env(config.env)
+        )
     # A run whose networks are others.
     run = create_run(config)
     size = config.env.layout.size
@@ -149,10 +151,10 @@ def test_the_latest_run_is_that_beside_the_new_one_or_else_of_the_task(
     monkeypatch.chdir(tmp_path)
     run = tmp_path / "runs/bounce_ball/2026-01-01_00-00-00"
     shutil.copytree(find_checkpoint("robust_small").run, run)
-    config = train_command.read_command("--warm-start latest --log-dir new".split()).config
+    config = settings_of("--warm-start latest --log-dir new".split()).config
     assert config.warm_start == best_checkpoint(run).folder
     assert config.log_dir == Path("new")
     # But where the new one's folder has runs, it is one of those, as with --resume.
     other = shutil.copytree(run, tmp_path / "mine/2025-01-01_00-00-00")
-    config = train_command.read_command("--warm-start latest --log-dir mine".split()).config
+    config = settings_of("--warm-start latest --log-dir mine".split()).config
     assert config.warm_start == best_checkpoint(other).folder

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import yaml
 
-from bounce_mjx.commands.train import read_command
 from bounce_mjx.config.settings import merged
 from bounce_mjx.config.validation import validate
 from bounce_mjx.deploy.environments import environment_config
@@ -21,7 +20,8 @@ from bounce_mjx.robot.config import LimitsConfig, RobotConfig
 from bounce_mjx.robot.model import add_balls, scene_spec
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.folders import find_checkpoint
-from bounce_mjx.runs.layers import Choice, read_layers, read_preset
+from bounce_mjx.runs.layers import read_layers, read_preset
+from bounce_mjx.runs.start import Choice
 from bounce_mjx.runs.worlds import (
     env_in_world,
     read_named_world,
@@ -34,6 +34,7 @@ from bounce_mjx.world.config import ActionConfig
 from bounce_mjx.world.model import model_nominals
 from bounce_mjx.world.named import read_world
 from bounce_mjx.world.randomization import TERMS, RandomizationConfig
+from tiny_runs import settings_of
 
 TWICE = "twice the assumed, or half"
 NAMES = ("ur5e_rtde", "panda_fci", "iiwa_fri", "fast_servo")
@@ -93,7 +94,7 @@ def test_a_mistake_is_one_sentence(tmp_path: Path, changes: dict, wrong: str) ->
 def test_training_has_the_world_in_place_of_the_presets(tmp_path: Path) -> None:
     world = written(tmp_path)
     preset = read_preset(Path("transfer")).env
-    command = read_command(
+    command = settings_of(
         ["--config", "transfer", "--world", str(world), "--randomization.frame-drop", "0", "0.2"]
     )
     drawn = command.config.env.randomization
@@ -114,8 +115,8 @@ TILTED = {
 @pytest.mark.slow
 def test_a_world_with_ranges_of_axes_trains_and_is_doubled(tmp_path: Path) -> None:
     world = written(tmp_path, **TILTED)
-    assert read_command(["--world", str(world)]).config.env.randomization.paddle_tilt == TILT
-    given = read_command(["--world", str(world), "--randomization.paddle-tilt", "-0.1", "0.1"])
+    assert settings_of(["--world", str(world)]).config.env.randomization.paddle_tilt == TILT
+    given = settings_of(["--world", str(world), "--randomization.paddle-tilt", "-0.1", "0.1"])
     assert given.config.env.randomization.paddle_tilt == (-0.1, 0.1)
     trained = TrainConfig()
     there = env_in_world(trained.env, world)
@@ -184,12 +185,12 @@ def test_less_of_a_limit_is_harder(tmp_path: Path) -> None:
 
 
 def test_a_world_brings_its_robot() -> None:
-    command = read_command(["--config", "cpu", "--world", "ur5e_rtde"])
+    command = settings_of(["--config", "cpu", "--world", "ur5e_rtde"])
     assert command.config.env.mjcf.name == "ur5e.xml"
     assert command.config.env.robot.site == "attachment_site"
     assert command.config.env.robot.servo_stiffness[0] > 1e4
     with pytest.raises(UserError, match="is for the robot ur5e, and a robot is given too"):
-        read_command(["--world", "ur5e_rtde", "--robot", "panda"])
+        settings_of(["--world", "ur5e_rtde", "--robot", "panda"])
 
 
 def test_a_world_names_a_robots_file_from_its_own_folder(tmp_path: Path, monkeypatch) -> None:
@@ -201,7 +202,7 @@ def test_a_world_names_a_robots_file_from_its_own_folder(tmp_path: Path, monkeyp
     robot = robot_in_world(Path("arm.yaml"), Path("worlds/world.yaml"))
     world = written(tmp_path / "worlds", robot=robot)
     monkeypatch.chdir("/")
-    assert read_command(["--config", "cpu", "--world", str(world)]).config.env.action_scale == 0.013
+    assert settings_of(["--config", "cpu", "--world", str(world)]).config.env.action_scale == 0.013
     assert robot_in_world(Path("ur5e"), Path("worlds/world.yaml")) == "ur5e"
 
 
@@ -216,7 +217,7 @@ def test_a_robots_own_balls_and_stiff_contact_are_taken_by_another_task(tmp_path
     env = {"mjcf": str(scene), "physics_dt": 0.0005, "num_balls": 2}
     robot = tmp_path / "robot.yaml"
     robot.write_text(yaml.safe_dump({"task": "juggle", "env": env}))
-    config = read_command(["catch", "--robot", str(robot)]).config.env
+    config = settings_of(["catch", "--robot", str(robot)]).config.env
     assert config.physics_dt == 0.0005
     assert config.ball_init_pos == pytest.approx(Catch.Config().ball_init_pos, abs=1e-3)
     assert policy_metadata(TrainConfig(task="juggle", env=env), 1).num_balls == 2
@@ -239,7 +240,7 @@ def test_a_warm_start_is_in_the_world_in_which_its_policy_is_measured() -> None:
     """One function says what a policy's environment is in a world, for a training too."""
     trained = load_run_config(find_checkpoint("robust_small").run).env
     for world in (None, "fast_servo"):
-        choice = Choice(start="robust_small", world=None if world is None else Path(world))
+        choice = Choice(word="robust_small", world=None if world is None else Path(world))
         begun = read_layers(choice, resource_path("configs/cpu.yaml")).config().env
         assert begun == env_in_world(trained, world)
 
@@ -249,7 +250,7 @@ def test_a_robots_file_is_of_no_other_algorithm_or_warm_start(tmp_path: Path) ->
         robot = tmp_path / f"{key}.yaml"
         robot.write_text(yaml.safe_dump({key: value, "env": {}}), encoding="utf-8")
         with pytest.raises(UserError, match=f"the robot .*{key}.yaml .*{value}"):
-            read_command(["--config", "cpu", "--robot", str(robot)])
+            settings_of(["--config", "cpu", "--robot", str(robot)])
 
 
 def test_a_world_of_a_robot_brings_its_limits_to_a_policy() -> None:

@@ -7,7 +7,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import jax
@@ -28,6 +28,11 @@ TINY = (
 ).split()
 # Generous, because a busy machine compiles slowly.
 TIMEOUT = 300.0
+
+
+def settings_of(words: Sequence[str], machine: Path | None = None) -> train_command.Settings:
+    """What a command line of `bounce-mjx train` trains, by default on this machine."""
+    return train_command.read_command(words).settings(machine)
 
 
 def shared_run(name: str = "straight", *flags: str) -> Path:

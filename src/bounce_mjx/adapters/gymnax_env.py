@@ -45,7 +45,7 @@ class GymnaxTaskEnv:
         Raises:
           UserError: it has a warm-up.
         """
-        refuse_warmup(env.config, self.name)
+        refuse_warmup(env.config.randomization, self.name)
         self.core = env
         """The `Env` in it."""
         self.default_params = EnvParams(self.core.config.episode_steps)

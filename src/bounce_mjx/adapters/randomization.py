@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from bounce_mjx.deploy.environments import refuse_warmup
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.physics.edited import INSEPARABLE, edited
@@ -65,11 +66,7 @@ def domain_randomize(
         another robot.
     """
     config = config or default_terms()
-    if config.warmup_steps:
-        raise UserError(
-            "the randomisation has warmup_steps, but the ranges of a randomization_fn do not grow; "
-            "set warmup_steps to 0"
-        )
+    refuse_warmup(config, "a randomization_fn")
     if config.ball_inertia is not None:
         raise UserError(
             "the randomisation has ball_inertia, but a randomization_fn has no inertia of a ball, "

@@ -117,10 +117,18 @@ def warnings(adoption: "Adoption", model: "mujoco.MjModel", config: WorldConfig)
             "real ones are faster, give theirs as env.robot.servo_stiffness, servo_damping and "
             "servo_force_limit"
         )
+    stated = "the file says no limits of velocity and acceleration"
+    velocities = adoption.arm.velocities
+    if velocities is not None:
+        numbers = ", ".join(f"{velocity:g}" for velocity in velocities)
+        stated = (
+            f"the file's limits of velocity, {numbers} rad/s, do not act without those of "
+            "acceleration, which no URDF has"
+        )
     yield (
-        "the file says no limits of velocity and acceleration, and a target may jump by "
-        f"{adoption.action_scale:g} rad in a control step; before a real arm, give the "
-        "manufacturer's as env.robot.limits, with env.action.base: target"
+        f"{stated}, and a target may jump by {adoption.action_scale:g} rad in a control step; "
+        "before a real arm, give the manufacturer's as env.robot.limits, with env.action.base: "
+        "target"
     )
 
 

@@ -23,7 +23,7 @@ from bounce_mjx.evaluation import config as evaluation
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import RandomizationConfig
 
-# What is of the evaluation alone; a name that ends with = has a value.
+# Flags that `play` lacks, which the command of a film leaves out; one that ends with = has a value.
 _NOT_OF_PLAY = ("--failures", "--contacts", "--limits", "--json=", "--physics=")
 
 
@@ -38,7 +38,7 @@ class EvalCommand(WhichPolicy):
     """Episodes, each from its own reset."""
     seed: NonNegativeInt = evaluation.DEFAULT_SEED
     """Seed of the resets."""
-    nominal: bool = False
+    nominal: Annotated[bool, Flag(excludes=("world", "randomization"))] = False
     """Evaluate without domain randomisation, and with the task's default goals where the policy
     was trained with them. Without this flag, each episode samples its world and goals, as in
     training."""
@@ -54,7 +54,7 @@ class EvalCommand(WhichPolicy):
     package and for the mirror law, here."""
     physics: evaluation.Physics = "config"
     """Physics engine: mujoco is MuJoCo's C engine; config is the engine used in training."""
-    json_file: Annotated[Path | None, Flag(name="json", instead_of="--out")] = None
+    json_file: Annotated[Path | None, Flag(name="json", instead_of=("--out",))] = None
     """File to write the results to."""
 
 
@@ -88,9 +88,8 @@ def main(args: Sequence[str]) -> None:
 
     check_output(command.json_file, "--json")
     console = stdout()
-    world = world_of_flags(command.nominal, command.world, command.randomization)
-    command.check_log_dir(command.checkpoint)
-    checkpoint = command.choose(command.checkpoint, command.robot)
+    world = world_of_flags(command.world, command.randomization)
+    (checkpoint,) = command.choose(command.checkpoint, robot=command.robot)
     config = command.config_of(checkpoint, command.robot, world)
     if command.limits and config.env.robot.limits.velocity is None:
         raise UserError("the policy's arm has no command limits (env.robot.limits); omit --limits")
@@ -98,7 +97,7 @@ def main(args: Sequence[str]) -> None:
     goals = given_goals.checked(config.env)
     set_up_jax(evaluation.on_engine(config.env, command.physics))
     checkpoint, policy, actor = read_actor(checkpoint, config)
-    # Beside what is no run, nothing is written.
+    # In the user's run; for a policy of the package and the mirror law, here.
     picture = (checkpoint.run if is_users_run(checkpoint.run) else Path()) / "failures.png"
     steps = f" ({checkpoint.steps:,} steps)" if checkpoint.steps else ""
     print(f"checkpoint: {checkpoint.folder}{steps}")

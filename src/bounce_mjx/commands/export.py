@@ -16,7 +16,7 @@ class ExportCommand(WhichPolicy):
     policy that comes with the package: pretrained, robust, robust_small, or the name of a task or
     an arm. The default is the newest run, or the task's policy in the package if there is no
     run."""
-    onnx: Annotated[Path, Flag(instead_of="--out")] = Path("policy.onnx")
+    onnx: Annotated[Path, Flag(instead_of=("--out",))] = Path("policy.onnx")
     """ONNX file to write: normaliser, network and clipping in one graph, and metadata."""
 
 
@@ -29,9 +29,9 @@ def main(args: Sequence[str]) -> None:
     from bounce_mjx.training.setup import set_up_jax
 
     check_output(command.onnx, "--onnx")
-    command.check_log_dir(command.checkpoint)
+    folder = command.folder_for(command.checkpoint)
     set_up_jax()
-    checkpoint = choose_checkpoint(command.checkpoint, command.folder)
+    checkpoint = choose_checkpoint(command.checkpoint, folder)
     print(f"checkpoint: {checkpoint.folder} ({checkpoint.steps:,} steps)")
     content = export_onnx(checkpoint)
     write_output(command.onnx, content)

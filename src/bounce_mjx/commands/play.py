@@ -5,7 +5,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from bounce_mjx.commands.goals import GivenGoals, parse_with_goals
+from bounce_mjx.commands.goals import parse_with_goals
 from bounce_mjx.commands.which_policy import (
     MirrorRobot,
     OtherRandomization,
@@ -48,14 +48,16 @@ class PlayCommand(WhichPolicy):
     episode: NonNegativeInt | None = None
     """Episode of an evaluation to show again, as it was: its number in the list of bounce-mjx eval
     --failures, from 0. --seed, --episodes, --nominal and the world are then those of eval."""
-    condition: str | None = None
+    condition: Annotated[
+        str | None, Flag(needs="episode", excludes=("nominal", "randomization", "goals"))
+    ] = None
     """Condition of bounce-mjx robustness of which an episode is shown, such as "action latency
     40 ms"; --world is then that which the suite changes."""
-    suite: Path = Path("robustness")
+    suite: Annotated[Path, Flag(needs="condition")] = Path("robustness")
     """Suite of the condition: a file, or the name of one in configs/."""
-    episodes: Count | None = None
+    episodes: Annotated[Count | None, Flag(needs="episode")] = None
     """Episodes of that evaluation; by default 1,024, of a condition 64."""
-    nominal: bool = False
+    nominal: Annotated[bool, Flag(needs="episode", excludes=("world", "randomization"))] = False
     """Whether that evaluation was without domain randomisation."""
     viewing: ViewerOptions = ViewerOptions()
 
@@ -65,21 +67,12 @@ def main(args: Sequence[str]) -> None:
     command, given_goals = parse_with_goals(PlayCommand, args, prog="bounce-mjx play")
     if len(command.checkpoints) > MAX_ENVS:
         raise UserError(f"{len(command.checkpoints)} policies are given; give at most {MAX_ENVS}")
-    command.check_log_dir(*command.checkpoints or (None,))
-    world = world_of_flags(command.nominal, command.world, command.randomization)
+    world = world_of_flags(command.world, command.randomization)
     if command.condition is not None:
         # The suite changes the named world, or that of the training.
         world = AS_TRAINED
-    if "suite" in command.model_fields_set and command.condition is None:
-        raise UserError("--suite is that of a condition; add --condition, or omit --suite")
-    if command.episode is None:
-        flags = {"--nominal": command.nominal, "--episodes": command.episodes}
-        flags |= {"--condition": command.condition}
-        if given := [flag for flag, value in flags.items() if value]:
-            what = "is" if len(given) == 1 else "are"
-            raise UserError(f"{' and '.join(given)} {what} of an evaluation; add its --episode")
-    else:
-        _check_film(command, given_goals)
+    if command.episode is not None:
+        _check_episode(command)
     # Before the seconds that imports and the compilation take.
     print("starting: the simulation is compiled, which takes longer the first time", flush=True)
     from bounce_mjx.reports.tables import count_text
@@ -90,7 +83,7 @@ def main(args: Sequence[str]) -> None:
     from bounce_mjx.viewers.show import Shown, show
     from bounce_mjx.viewers.simulation import make_policy_controller
 
-    chosen = [command.choose(path, command.robot) for path in command.checkpoints or (None,)]
+    chosen = command.choose(*command.checkpoints or (None,), robot=command.robot)
     configs = [command.config_of(checkpoint, command.robot, world) for checkpoint in chosen]
     # All are of one task, which `show` checks, and so have the same goals.
     for config in configs:
@@ -154,15 +147,10 @@ def _episode_finder(
     return partial(find_episode, conditions, index, options, command.episode)
 
 
-def _check_film(command: PlayCommand, given_goals: GivenGoals) -> None:
-    """Raises UserError for what an episode cannot be shown with."""
+def _check_episode(command: PlayCommand) -> None:
+    """Raises UserError if there is no such episode of one policy."""
     if len(command.checkpoints) > 1 or command.viewing.num_envs > 1:
         raise UserError("--episode shows one episode of one policy; give one policy, one robot")
-    changes = command.nominal or command.randomization.terms or given_goals.values
-    if command.condition is not None and changes:
-        raise UserError(
-            "--condition is a whole world; omit --nominal, --randomization and the goals"
-        )
     episodes = _num_episodes(command)
     if command.episode >= episodes:
         raise UserError(

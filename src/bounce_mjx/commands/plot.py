@@ -30,10 +30,9 @@ def main(args: Sequence[str]) -> None:
     command = parse(PlotCommand, args, prog="bounce-mjx plot")
     from bounce_mjx.runs.folders import find_checkpoint, runs_of_seeds
 
-    command.check_log_dir(*command.runs or (None,))
-    runs = [command.choose_run(run) for run in command.runs or (None,)]
-    seeds = [seed for run in runs for seed in runs_of_seeds(run)]
-    checkpoints = [find_checkpoint(seed) for seed in seeds]
+    runs = command.choose_runs(*command.runs or (None,))
+    folders = [folder for run in runs for folder in runs_of_seeds(run)]
+    checkpoints = [find_checkpoint(folder) for folder in folders]
     configs = [load_run_config(checkpoint.run) for checkpoint in checkpoints]
 
     # These take seconds, which a mistake in the words above should not.

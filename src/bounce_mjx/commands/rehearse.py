@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 _PROG = "bounce-mjx rehearse"
 _YAML = (".yaml", ".yml")
 _SIZE = (640, 480)
+# Half of a screen's: where no GPU renders, a picture takes longer than what it shows.
+_FILM_FPS = 25
 # Half of the box around the paddle's home that is taken by default, m.
 _BOX = 0.5
 # Length of a planned motion, s.
@@ -90,8 +92,9 @@ def _rehearse_policy(command: RehearseCommand, given_goals: GivenGoals) -> None:
     from bounce_mjx.rehearsal.arm import goals_in_turn
     from bounce_mjx.rehearsal.operator import SimulatedOperator
 
-    policy = load_policy(_policy_file(command))
-    config = _config_of_policy(command)
+    file = _policy_file(command)
+    policy = load_policy(file)
+    config = _config_of_policy(command, file)
     given = given_goals.checked(config)
     goals = goals_in_turn(config, {name: (value,) for name, value in given.items()})
     arm = _arm(command, config)
@@ -114,13 +117,15 @@ def _policy_file(command: RehearseCommand) -> Path:
     if command.policy is not None:
         is_file = command.policy.is_file()
         if is_file or policy_folder(command.policy) is not None:
-            command.check_log_dir(command.policy)
+            # Refuses --log-dir beside it.
+            command.folder_for(command.policy)
             return command.policy
-    return command.choose(command.policy).folder
+    (checkpoint,) = command.choose(command.policy)
+    return checkpoint.folder
 
 
-def _config_of_policy(command: RehearseCommand) -> "WorldConfig":
-    """The environment of the policy's training, in the world of the rehearsal.
+def _config_of_policy(command: RehearseCommand, policy: Path) -> "WorldConfig":
+    """The environment of a policy's training, in the world of the rehearsal.
 
     Raises:
       UserError: there is none, or --robot is another arm.
@@ -129,7 +134,7 @@ def _config_of_policy(command: RehearseCommand) -> "WorldConfig":
     from bounce_mjx.deploy.interface import robot_name
     from bounce_mjx.runs.worlds import AS_TRAINED, TRAINING, env_in_world
 
-    config = environment_config(policy=_policy_file(command), world=command.world or TRAINING)
+    config = environment_config(policy=policy, world=command.world or TRAINING)
     if command.robot is None:
         return config
     given = env_in_world(config.task, AS_TRAINED, command.robot)
@@ -228,7 +233,7 @@ def _film(command: RehearseCommand, config: "WorldConfig", arm: "SimulatedArm", 
     from bounce_mjx.rehearsal.film import pictures
     from bounce_mjx.viewers.video import VideoWriter
 
-    writer = VideoWriter(command.film, _SIZE, None)
+    writer = VideoWriter(command.film, _SIZE, _FILM_FPS)
     writer.write_pictures(pictures(Env(config), arm.path, goals, _SIZE, writer.fps))
     print(f"film: {command.film}")
 

@@ -22,8 +22,7 @@ def main(args: Sequence[str]) -> None:
     command = parse(ReportCommand, args, prog="bounce-mjx report")
     from bounce_mjx.runs.folders import find_checkpoint
 
-    command.check_log_dir(command.run)
-    run = command.choose_run(command.run)
+    (run,) = command.choose_runs(command.run)
     checkpoint = find_checkpoint(run)
     # With several seeds, that of the best one lies below the run.
     if checkpoint.run.absolute() in run.absolute().parents:

@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated
 
 from rich.progress import Progress
 
@@ -13,13 +14,12 @@ from bounce_mjx.commands.which_policy import (
     film_command,
     suite_conditions,
 )
-from bounce_mjx.config.command_line import parse, stdout
+from bounce_mjx.config.command_line import Flag, parse, stdout
 from bounce_mjx.config.settings import Count, NonNegativeInt
 from bounce_mjx.config.user_code import import_flags
-from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation import config as evaluation
 
-# What is of the measurement alone; a name that ends with = has a value.
+# Flags that `play` lacks, which the command of a film leaves out; one that ends with = has a value.
 _NOT_OF_PLAY = ("--assumed", "--out=", "--physics=")
 
 
@@ -32,7 +32,7 @@ class RobustnessCommand(WhichPolicy):
     """World that each condition changes, in place of the model's own: a YAML file, or the name of
     one in configs/worlds/ (ur5e_rtde, panda_fci, iiwa_fri or fast_servo). Twice each of its assumed
     numbers, or half where less is harder, is a condition too."""
-    assumed: bool = False
+    assumed: Annotated[bool, Flag(needs="world", excludes=("suite",))] = False
     """Only the world itself and its assumed numbers doubled or halved, without the suite."""
     suite: Path = Path("robustness")
     """YAML file of the perturbations, or the name of one in configs/: robustness is version 1, and
@@ -61,13 +61,8 @@ def main(args: Sequence[str]) -> None:
     from bounce_mjx.runs.storage import to_json, writable, write_output
     from bounce_mjx.training.setup import set_up_jax
 
-    if command.assumed and command.world is None:
-        raise UserError("--assumed needs a named world; give one with --world, or leave it out")
-    if command.assumed and "suite" in command.model_fields_set:
-        raise UserError("--assumed leaves the suite out; omit --suite, or --assumed")
     console = stdout()
-    command.check_log_dir(command.checkpoint)
-    checkpoint = command.choose(command.checkpoint, command.robot)
+    (checkpoint,) = command.choose(command.checkpoint, robot=command.robot)
     config = command.config_of(checkpoint, command.robot)
     path, conditions, num_assumed = suite_conditions(command.suite, config, command.world)
     suite, version = str(path), read_suite(path).version

@@ -7,7 +7,8 @@ from typing import Literal
 from bounce_mjx.config.command_line import flag_names, parse, read_flags, stdout
 from bounce_mjx.config.files import flat
 from bounce_mjx.config.settings import StrictModel, fields_in
-from bounce_mjx.runs.layers import Choice, read_layers
+from bounce_mjx.runs.layers import read_layers
+from bounce_mjx.runs.start import Choice
 from bounce_mjx.task.registry import DEFAULT
 from bounce_mjx.viewers.options import ViewerOptions
 
@@ -34,7 +35,7 @@ def main(args: Sequence[str]) -> None:
     # The task and the robot, read first, decide which flags of the environment there are. The
     # second reading gives the command's own flags again, and they are left out.
     command = parse(ViewCommand, args, prog=PROG, is_first=True)
-    preset = Choice(start=command.task, config=(Path("default"),), robot=command.robot)
+    preset = Choice(word=command.task, config=(Path("default"),), robot=command.robot)
     layers = read_layers(preset)
     of_env = {key: field for key, field in layers.fields.items() if key.startswith("env.")}
     fields = fields_in(ViewCommand) | of_env

@@ -46,6 +46,7 @@ MirrorRobot = Annotated[
 
 OtherWorld = Annotated[
     Path | None,
+    Flag(excludes=("randomization",)),
     Field(
         description="World in place of that of the training: a YAML file, or the name of one in "
         "configs/worlds/ (ur5e_rtde, panda_fci, iiwa_fri or fast_servo)."
@@ -61,17 +62,13 @@ OtherRandomization = Annotated[
 """Type of the flags for a what-if world."""
 
 
-def world_of_flags(nominal: bool, world: Path | None, randomization: RandomizationConfig) -> World:
+def world_of_flags(world: Path | None, randomization: RandomizationConfig) -> World:
     """The world that a command's flags ask for; `AS_TRAINED` without one. --nominal is an option of
     the evaluation, `EvaluationOptions.nominal`, which fixes the goals too.
 
     Raises:
-      UserError: several are given, or what is given of --randomization has no term to act on.
+      UserError: what is given of --randomization has no term to act on.
     """
-    flags = {"--nominal": nominal, "--world": world, "--randomization": randomization.terms}
-    given = [flag for flag, value in flags.items() if value]
-    if len(given) > 1:
-        raise UserError(f"{' and '.join(given)} cannot be combined; omit one")
     if randomization.terms:
         return randomization
     if randomization != RandomizationConfig():
@@ -140,61 +137,61 @@ class WhichPolicy(StrictModel):
     log_dir: Path | None = None
     """Folder in which to look for the newest run; by default, that of the task's runs."""
 
-    @property
-    def folder(self) -> Path:
-        """`log_dir`, or the folder of the task's runs."""
-        return self.log_dir or runs_folder(find_task(self.task or DEFAULT))
-
-    def check_log_dir(self, *paths: Path | None) -> None:
-        """Refuses a folder in which to look for the newest run where the user names every policy.
-
-        Raises:
-          UserError: --log-dir is given, and no path stands for the newest run.
-        """
-        if self.log_dir is None:
-            return
-        from bounce_mjx.runs.folders import is_newest
-
-        if not any(map(is_newest, paths)):
-            raise UserError(
-                f"--log-dir is where the newest run is looked for, and {paths[0]} is named; omit "
-                "one of them"
-            )
-
-    def choose(self, path: Path | None, robot: Path | None = None) -> "Checkpoint":
-        """`choose_checkpoint`, or `MIRROR_LAW` for the word mirror.
+    def choose(self, *paths: Path | None, robot: Path | None = None) -> list["Checkpoint"]:
+        """The checkpoint of each path: `choose_checkpoint`, or `MIRROR_LAW` for the word mirror.
 
         Args:
           robot: of the mirror law.
 
         Raises:
-          UserError: there is none, or a robot is given for a policy.
+          UserError: there is none, a robot is given for a policy, or --log-dir beside named ones.
         """
+        folder = self.folder_for(*paths)
+        return [self._choose(path, folder, robot) for path in paths]
+
+    def choose_runs(self, *paths: Path | None) -> list[Path]:
+        """The run of each path, with its log: `run_or_newest`.
+
+        Raises:
+          UserError: there is none, it is a policy of the package, which has no log, or --log-dir is
+            given beside named ones.
+        """
+        from bounce_mjx.runs.folders import run_or_newest
+
+        folder = self.folder_for(*paths)
+        for path in paths:
+            if policy_folder(path) is not None:
+                raise UserError(
+                    f"the policy {path} comes with the package, without the log of its training; "
+                    "give a run's folder"
+                )
+        return [run_or_newest(path, folder) for path in paths]
+
+    def folder_for(self, *paths: Path | None) -> Path:
+        """Where the newest run is looked for: `log_dir`, or the folder of the task's runs.
+
+        Raises:
+          UserError: --log-dir is given, and each path is that of a run or a policy.
+        """
+        if self.log_dir is None:
+            return runs_folder(find_task(self.task or DEFAULT))
+        from bounce_mjx.runs.folders import check_newest
+
+        check_newest(paths)
+        return self.log_dir
+
+    @staticmethod
+    def _choose(path: Path | None, folder: Path, robot: Path | None) -> "Checkpoint":
         from bounce_mjx.runs.folders import MIRROR_LAW, choose_checkpoint
 
         is_folder = path is not None and os.path.isdir(path)
         if str(path) == MIRROR and not is_folder:
             return MIRROR_LAW
         if path is not None and not is_folder and (near := suggest(str(path), [MIRROR])):
-            raise UserError(f"there is no checkpoint folder and no policy {path}; {near}")
+            raise UserError(f"there is no run and no policy {path}; {near}")
         if robot is not None:
             raise UserError("--robot is for the mirror law; omit it, or give mirror as checkpoint")
-        return choose_checkpoint(path, self.folder)
-
-    def choose_run(self, path: Path | None) -> Path:
-        """A run with its log: `run_or_newest`.
-
-        Raises:
-          UserError: there is none, or it is a policy of the package, which has no log.
-        """
-        from bounce_mjx.runs.folders import run_or_newest
-
-        if policy_folder(path) is not None:
-            raise UserError(
-                f"the policy {path} comes with the package, without the log of its training; give "
-                "a run's folder"
-            )
-        return run_or_newest(path, self.folder)
+        return choose_checkpoint(path, folder)
 
     def config_of(
         self, checkpoint: "Checkpoint", robot: Path | None = None, world: World = AS_TRAINED

@@ -38,8 +38,12 @@ class Flag(NamedTuple):
     """Whether the value has no flag."""
     is_repeated: bool = False
     """Whether the flag may come several times, each with one of the values."""
-    instead_of: str | None = None
-    """A flag of other commands for which this command has this one, such as --out: for an error."""
+    instead_of: tuple[str, ...] = ()
+    """Flags of other commands for which this command has this one, such as --out: for an error."""
+    needs: str | None = None
+    """Key of a setting without which this one says nothing."""
+    excludes: tuple[str, ...] = ()
+    """Keys of settings and of groups beside which this one cannot be given."""
 
 
 def stdout(**options: Any) -> Console:
@@ -161,7 +165,27 @@ def read_flags(
         values[key] = _plain(fields[key].annotation, value)
         if isinstance(values[key], list) and dict in types_in(fields[key].annotation):
             values[key] = _pairs(values[key], flag_names(fields)[key], parser)
+    _check_together(values, fields, parser)
     return values
+
+
+def _check_together(
+    given: Mapping[str, Any], fields: Mapping[str, FieldInfo], parser: "_Parser"
+) -> None:
+    """Holds what is given against what its flags need and exclude.
+
+    Raises:
+      UserError: a flag is given without the one that it needs, or beside one that it excludes.
+    """
+    flags = flag_names(fields)
+    said = [key for key, value in given.items() if value is not None and value is not False]
+    for key in said:
+        mark = _mark(fields[key])
+        if mark.needs is not None and mark.needs not in said:
+            parser.error(f"{flags[key]} needs {flags[mark.needs]}; add it, or omit {flags[key]}")
+        for other in said:
+            if any(f"{other}.".startswith(f"{excluded}.") for excluded in mark.excludes):
+                parser.error(f"{flags[key]} and {flags[other]} cannot be combined; omit one")
 
 
 def plain_words(args: Sequence[str]) -> list[str]:
@@ -187,9 +211,12 @@ def _plain_word(word: str) -> str:
 
 def _near_flag(word: str, fields: Mapping[str, FieldInfo]) -> str:
     """A question about the flag that an unknown word may stand for; empty if none is near."""
-    stand_ins = {_mark(field).instead_of: key for key, field in fields.items()}
-    if word in stand_ins:
-        return f"did you mean {flag_names(fields)[stand_ins[word]]}?"
+    for key, field in fields.items():
+        mark = _mark(field)
+        if word in mark.instead_of:
+            if mark.is_positional:
+                return f"its value has no flag, and stands first: {mark.metavar}"
+            return f"did you mean {flag_names(fields)[key]}?"
     return suggest(word, flags_of(fields))
 
 

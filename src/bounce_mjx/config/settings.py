@@ -10,7 +10,7 @@ import numbers
 import re
 import typing
 from collections.abc import Iterator
-from typing import Annotated, Any, NamedTuple, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import pydantic
 from pydantic import Field
@@ -133,21 +133,6 @@ class StrictModel(pydantic.BaseModel):
                     plain = default.model_dump(exclude_unset=True)
                     completed[name] = merged(plain, values[name])
         return completed
-
-
-class Layer(NamedTuple):
-    """The settings of one source."""
-
-    source: str
-    """For people, such as configs/cpu.yaml."""
-    values: dict[str, Any]
-    """Nested, with the keys of `TrainConfig`."""
-    is_world: bool = False
-    """Whether it replaces all terms of the randomisation. A preset's curriculum of terms that this
-    world does not have is dropped (`without_idle_curriculum`)."""
-    whole: tuple[str, ...] = ()
-    """Dotted keys of what it brings whole: also of a mapping, such as `shares`, nothing remains of
-    the layers below."""
 
 
 def types_in(kind: Any) -> Iterator[Any]:

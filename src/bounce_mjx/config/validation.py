@@ -1,6 +1,7 @@
 """Turns plain values into settings; a mistake is one sentence."""
 
 import difflib
+import operator
 import re
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType
@@ -36,6 +37,21 @@ def validate(
     except pydantic.ValidationError as error:
         fields = fields_in(config_class, f"{group}." if group else "")
         raise UserError(f"{shorten(source)}: {describe(error, fields, group=group)}") from error
+
+
+def checked_count(name: str, value: Any) -> int:
+    """A whole number of at least 1, of an argument in Python.
+
+    Raises:
+      UserError: it is none.
+    """
+    try:
+        number = operator.index(value)
+    except TypeError:
+        number = 0
+    if number < 1:
+        raise UserError(f"{name} is {value!r}, but must be a whole number of at least 1")
+    return number
 
 
 def describe(

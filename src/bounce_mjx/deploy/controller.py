@@ -134,10 +134,10 @@ class Controller:
             picture = memory.seen.picture if left == 0 else None
             history, new_action = self.network.step(history, between, action, picture)
         if angles is not None:
-            course = self.aim(course, angles, new_action)
+            course = self.course_of(course, angles, new_action)
         return Memory(memory.seen, history, new_action, measured, course)
 
-    def aim(self, course: Course, angles: np.ndarray, action: np.ndarray) -> Course:
+    def course_of(self, course: Course, angles: np.ndarray, action: np.ndarray) -> Course:
         """The commands after others, under an action.
 
         Args:

@@ -56,7 +56,7 @@ class Driver:
         """Index of each of the policy's joints among the driver's."""
         self.metadata = metadata
         """The metadata in the driver's order."""
-        self.own = metadata
+        self.policy_metadata = metadata
         """The metadata in the policy's order, with the driver's names of the joints."""
         if names is not None:
             order = _joint_order(names, metadata)
@@ -64,7 +64,7 @@ class Driver:
             self._places = np.argsort(order)
             self.metadata = in_driver_order(metadata, tuple(names), order)
             own_names = tuple(self.metadata.joint_names[place] for place in self._places)
-            self.own = metadata._replace(joint_names=own_names)
+            self.policy_metadata = metadata._replace(joint_names=own_names)
         self.needs = tuple(needs)
         self.units = UNITS | {name: c.unit or "no unit" for name, c in metadata.goals.items()}
         """Measurements that a step accepts, and their units."""

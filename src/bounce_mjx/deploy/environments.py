@@ -32,6 +32,7 @@ from bounce_mjx.task.registry import (
 )
 from bounce_mjx.task.task import Task
 from bounce_mjx.world.config import WorldConfig
+from bounce_mjx.world.randomization import RandomizationConfig
 
 ONNX = ".onnx"
 
@@ -92,13 +93,9 @@ def environment_config(
     if policy is not None:
         if isinstance(start, WorldConfig):
             raise UserError("a config and a policy both say the environment; give one of them")
-        if robot is not None:
-            raise UserError("a policy brings its robot; leave robot out")
-        return _of_policy(policy, start, world, settings)
+        return _of_policy(policy, start, world, _path(robot), settings)
     if isinstance(start, WorldConfig):
-        if robot is not None:
-            raise UserError("a config has its robot; leave robot out")
-        return with_settings(env_in_world(start, world), settings)
+        return with_settings(env_in_world(start, world, _path(robot)), settings)
     task = find_task(start or DEFAULT) if isinstance(start or DEFAULT, str) else start
     return with_settings(env_in_world(task, world, _path(robot)), settings)
 
@@ -120,17 +117,17 @@ def with_settings(config: WorldConfig, settings: Mapping[str, Any]) -> WorldConf
     return validate(type(config), merged(config.model_dump(), on_top), "the environment")
 
 
-def refuse_warmup(config: WorldConfig, title: str) -> None:
-    """Refuses the settings of a warm-up in an environment that has no count of a training's steps,
-    over which its ranges would grow.
+def refuse_warmup(randomization: RandomizationConfig, title: str) -> None:
+    """Refuses the settings of a warm-up where there is no count of a training's steps, over which
+    its ranges would grow.
 
     Args:
-      title: of the environment, for the error.
+      title: of the environment or the function, for the error.
 
     Raises:
       UserError: they have one.
     """
-    if config.randomization.warmup_steps:
+    if randomization.warmup_steps:
         raise UserError(
             f"{title}: the randomisation has warmup_steps, but its ranges do not grow here; set "
             "warmup_steps to 0 and first_goal_range to 1, or train with TorchVectorEnv"
@@ -154,6 +151,7 @@ def _of_policy(
     policy: str | os.PathLike,
     task: str | type[Task] | None,
     world: str | os.PathLike | None,
+    robot: Path | None,
     settings: Mapping[str, Any],
 ) -> WorldConfig:
     """The settings of the environment of a policy's training, in a world, with settings on top.
@@ -182,7 +180,7 @@ def _of_policy(
             f"the policy {policy} is of the task {name_of_policy}, and the environment of the task "
             f"{name}; leave one of them out"
         )
-    config = with_settings(env_in_world(trained, world or NOMINAL), settings)
+    config = with_settings(env_in_world(trained, world or NOMINAL, robot), settings)
     check_interface(
         interface_of(trained),
         interface_of(config),

@@ -19,7 +19,7 @@ from bounce_mjx.deploy.interface import robot_name
 from bounce_mjx.deploy.metadata import (
     FORMAT,
     IS_FIRST,
-    MEASURED,
+    NEWEST,
     NEXT,
     UNITS,
     BallBounds,
@@ -92,8 +92,8 @@ def export_onnx(checkpoint: Checkpoint) -> bytes:
     networks = make_networks(config.ppo, config.env.layout.size, config.env.num_joints)
     metadata = policy_metadata(config, checkpoint.steps)
     if config.env.action.base == "measured":
-        step = largest_step(config.env, functools.partial(networks.act, policy))
-        metadata = metadata._replace(largest_step=(step,) * len(metadata.joint_names))
+        angle = largest_step(config.env, functools.partial(networks.act, policy))
+        metadata = metadata._replace(largest_step=(angle,) * len(metadata.joint_names))
     names = [part.name for part in _inputs(config.env)]
 
     def act(histories: dict[str, jax.Array]) -> jax.Array:
@@ -115,7 +115,8 @@ def export_onnx(checkpoint: Checkpoint) -> bytes:
 
 def policy_metadata(config: TrainConfig, steps: int) -> Metadata:
     """Metadata of a run's policy. Its `largest_step` is that of actions that add to the last
-    target; where they add to the measured angles, `export_onnx` puts the measured one in its place.
+    target; where they add to the measured angles, `export_onnx` replaces it by that of the policy's
+    own play.
 
     Args:
       steps: environment steps of the training.
@@ -342,7 +343,7 @@ def _control_step(
     def control_step(arrays: dict[str, jax.Array]) -> dict[str, jax.Array]:
         values = {}
         for name, shaped in measured.items():
-            values[name] = arrays[MEASURED + name].reshape(shaped.shape)
+            values[name] = arrays[NEWEST + name].reshape(shaped.shape)
         past = {name: arrays[name] for name in of_task}
         before = structure.unflatten([arrays[name] for name in memory])
 
@@ -363,7 +364,7 @@ def _control_step(
         return outputs
 
     for name, shaped in measured.items():
-        inputs[MEASURED + name] = _floats(shaped.size)
+        inputs[NEWEST + name] = _floats(shaped.size)
     return control_step, inputs | memory | {IS_FIRST: jax.ShapeDtypeStruct((), bool)}
 
 

@@ -47,7 +47,7 @@ class Followed(NamedTuple):
     """The last control steps of an arm."""
 
     commands: np.ndarray
-    """At the ends of the last control steps [L, J], the newest first, rad."""
+    """At the ends of the last control steps [L, J], the newest last, rad."""
     beside: np.ndarray
     """Measured angles less those of the training's arms in the last 0.25 s [C, A, J], rad."""
     angles: np.ndarray
@@ -117,7 +117,8 @@ class Watch:
         """Distance of a resting joint from its command, rad."""
         noise = largest_term(metadata, "joint_angle_noise")
         self._least = _OF_SCALE[metadata.action_base] * metadata.action_scale + _OF_NOISE * noise
-        self._arms = arm_responses(metadata)
+        # The weights of the last commands, the newest last.
+        self._arms = np.ascontiguousarray(arm_responses(metadata)[:, ::-1])
         self._compared = math.ceil(_COMPARED / metadata.control_dt)
         self._settling = self._arms.shape[1] + self._compared
 
@@ -153,11 +154,11 @@ class Watch:
         Raises:
           Fault: a joint does not move as any arm of the training would.
         """
-        commands = _shifted(followed.commands[::-1], command, steps)[::-1]
+        commands = _shifted(followed.commands, command, steps)
         followed = followed._replace(commands=commands, steps=followed.steps + steps)
         if is_bridged:
             return followed
-        beside = angles - self._arms @ commands[: self._arms.shape[1]]
+        beside = angles - self._arms @ commands[-self._arms.shape[1] :]
         change = np.abs(angles - followed.angles[-1])
         has_changed = change > 0.0
         smallest = np.minimum(followed.smallest_change, change)
@@ -196,15 +197,18 @@ class Watch:
         )
 
     def _allowed_motion(self, followed: Followed) -> np.ndarray:
-        """Motion of each joint beside the training's arms [J] that is no fault, rad."""
-        allowed = self._least + np.minimum(followed.smallest_change, RESOLUTION)
-        allowed += _OF_COMMANDS * np.ptp(followed.commands, axis=0)
-        if followed.steps < self._settling:
-            # They go there with the first commands.
-            allowed += self._beside_command
+        """Motion of each joint beside the training's arms [J] that is no fault, rad: that of the
+        policy and its noise, a count of the encoder, a share of what the commands moved, and after
+        a rest where weight and servos take the joint; of a reading that repeats all the time, what
+        dry friction and its counts hide at most."""
+        of_count = np.minimum(followed.smallest_change, RESOLUTION)
+        of_commands = _OF_COMMANDS * np.ptp(followed.commands, axis=0)
+        is_settling = followed.steps < self._settling
+        of_rest = self._beside_command if is_settling else 0.0
+        moving = self._least + of_count + of_commands + of_rest
         # A moving joint's reading changes by a count, and one with noise in every step.
-        of_repeating = np.minimum(allowed, _HELD + _COUNTS * followed.smallest_change)
-        return np.where(followed.repeats >= self._compared, of_repeating, allowed)
+        repeating = np.minimum(moving, _HELD + _COUNTS * followed.smallest_change)
+        return np.where(followed.repeats >= self._compared, repeating, moving)
 
 
 def check_balls(balls: np.ndarray, age: float, max_age: float, paddle: np.ndarray) -> None:

@@ -1,6 +1,7 @@
 """Whether a ball falls: away from the paddle, its last pictures lie on a parabola of gravity's
 curvature; near it, where it bounces, they do not lie on a straight line, as those of a ball that a
-hand holds or carries do, unless the task lets the ball rest.
+hand holds or carries do, unless the task lets the ball rest; and seen from above it runs on, so
+that a picture lies between its neighbours.
 
 In free flight a ball's places are x0 + v t + g t^2 / 2. What is left of them after the least
 squares in x0 and v is judged in three directions: the largest of single pictures; the part along
@@ -46,6 +47,12 @@ _LEAVING = 2.0
 _FEW = 5
 # How far the root mean square of noise may be above its standard deviation, in deviations of it.
 _ABOVE = 3.5
+# Pictures of a ball near the paddle of which most lie between their neighbours (an impact is one
+# that need not), as far as the noise allows in standard deviations; and how many times that of a
+# picture the deviation of such a difference is, at most.
+_NEIGHBOURS = 6
+_BETWEEN = 3.0
+_OF_THREE = 1.4
 
 
 class Near(NamedTuple):
@@ -55,8 +62,8 @@ class Near(NamedTuple):
     """The time of its first picture, s."""
     times: np.ndarray
     """Of the pictures in the last 0.4 s [N], s."""
-    heights: np.ndarray
-    """Of the ball in them [N], m."""
+    places: np.ndarray
+    """Of the ball in them [N, 3], m."""
 
 
 class Flight(NamedTuple):
@@ -98,6 +105,12 @@ def flight_bounds(metadata: Metadata) -> FlightBounds:
         may_rest=metadata.ball_rests is not False,
         dt=metadata.control_dt,
     )
+
+
+def may_lie(bounds: FlightBounds, place: np.ndarray, paddle: np.ndarray) -> bool:
+    """Whether a ball may rest at its place [3], m: on the paddle, whose centre is at [3], m."""
+    x, y, height = place - paddle
+    return bounds.may_rest and math.hypot(x, y) < _REACH and abs(height) < _TOUCH
 
 
 class Fit(NamedTuple):
@@ -222,8 +235,10 @@ def _touching(
     """A picture before which the ball may have touched the paddle: a new flight begins."""
     near = flight.near
     if near is None:
-        near = Near(float(flight.times[-1]), flight.times[-1:], flight.places[-1:, 2])
+        near = Near(float(flight.times[-1]), flight.times[-1:], flight.places[-1:])
     near = _still_near(near, time, place)
+    if _goes_to_and_fro(near, bounds.noise):
+        return flight, "goes to and fro, as two things would that look like it"
     if not bounds.may_rest and len(near.times) >= _FEW:
         seconds = time - near.since
         if seconds > _HELD and _is_straight(near, bounds.noise):
@@ -239,16 +254,33 @@ def _still_near(near: Near, time: float, place: np.ndarray) -> Near:
     """With one more picture."""
     kept = near.times > time - _HELD
     times = np.append(near.times[kept], time)
-    heights = np.append(near.heights[kept], place[2])
-    return Near(near.since, times, heights)
+    places = np.vstack([near.places[kept], place])
+    return Near(near.since, times, places)
 
 
 def _is_straight(near: Near, noise: float) -> bool:
     """Whether the heights are those of a constant velocity, but for a noise (m)."""
     count = len(near.times)
     t = near.times - near.times.mean()
-    left = near.heights - near.heights.mean()
+    heights = near.places[:, 2]
+    left = heights - heights.mean()
     left -= t * ((t @ left) / (t @ t))
     # The root mean square of n values of deviation 1 has a deviation of 1 / sqrt(2 n).
     bound = 1.0 + _ABOVE / math.sqrt(2.0 * (count - 2))
     return math.sqrt((left @ left) / (count - 2)) < bound * noise
+
+
+def _goes_to_and_fro(near: Near, noise: float) -> bool:
+    """Whether most of the last pictures lie beside the way of a ball between their neighbours, seen
+    from above, but for a noise (m): they are of two things."""
+    if len(near.times) < _NEIGHBOURS:
+        return False
+    times = near.times[-_NEIGHBOURS:]
+    places = near.places[-_NEIGHBOURS:, :2]
+    duration = times[2:] - times[:-2]
+    share = ((times[1:-1] - times[:-2]) / duration)[:, None]
+    chord = places[2:] - places[:-2]
+    beside = places[1:-1] - places[:-2] - share * chord
+    speed = np.hypot(chord[:, 0], chord[:, 1]) / duration
+    allowed = _BETWEEN * _OF_THREE * np.hypot(noise, _TIMING * speed)
+    return bool(np.sum(np.hypot(beside[:, 0], beside[:, 1]) > allowed) > 0.5 * len(beside))

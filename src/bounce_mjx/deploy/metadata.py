@@ -44,7 +44,7 @@ Vector = tuple[float, float, float]
 # Names in the graph of a policy whose task remembers measurements.
 IS_FIRST = "step/is_first"
 """The input that is true in the first step."""
-MEASURED = "measured/"
+NEWEST = "measured/"
 """What precedes the name of a quantity's newest value, an input."""
 NEXT = "next/"
 """What precedes the name of an output for the input of the same name in the next step."""

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bounce_mjx.deploy.metadata import IS_FIRST, MEASURED, NEXT, Metadata, from_entries
+from bounce_mjx.deploy.metadata import IS_FIRST, NEWEST, NEXT, Metadata, from_entries
 from bounce_mjx.deploy.motion import paddle_position
 from bounce_mjx.deploy.samples import Measurements, Picture
 from bounce_mjx.errors import UserError, needed
@@ -79,8 +79,8 @@ class OnnxNetwork:
                 self._sizes[part.name] = (part.history, part.size)
         self._measured = []
         for name in self._inputs:
-            if name.startswith(MEASURED):
-                self._measured.append(name.removeprefix(MEASURED))
+            if name.startswith(NEWEST):
+                self._measured.append(name.removeprefix(NEWEST))
         self.reads = {*self._measured, *self._sizes}
         """Names of the quantities that the action depends on."""
         balls = np.zeros(3 * self.metadata.num_balls)
@@ -132,7 +132,7 @@ class OnnxNetwork:
                 quantities[name] = np.concatenate([newest[name][None], values[:-1]])
             rows[name][0] = quantities[name]
         for name in self._measured:
-            rows[MEASURED + name][0] = newest[name]
+            rows[NEWEST + name][0] = newest[name]
         if IS_FIRST in rows:
             rows[IS_FIRST][0] = history.is_first
         for name in self._read_again:

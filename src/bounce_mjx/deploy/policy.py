@@ -17,7 +17,7 @@ from bounce_mjx.errors import MissingPackage, UserError
 
 # What a network may need to be measured, beside the goals; the rest has a default, or is looked
 # at by a supervisor alone.
-MEASURED = (
+_MEASURED = (
     "joint_angles",
     "joint_velocities",
     "ball_position",
@@ -73,7 +73,7 @@ class DeployedPolicy:
         """Reads and commands the joints by a driver from now on, and forgets the past."""
         self.driver = driver
         """The names and the order in which measurements come."""
-        self.controller = Controller(self._network, driver.own)
+        self.controller = Controller(self._network, driver.policy_metadata)
         """The policy as a function of a memory, with the joints in its own order."""
         self._memory = self.controller.begin()
 
@@ -198,8 +198,9 @@ class DeployedPolicy:
                 "step with joint_angles first"
             )
         values = self.driver.read_joints("the action", action, "from -1 to 1", 1.0)
-        before = Course(memory.course.start)
-        course = self.controller.aim(before, memory.measured["joint_angles"], values)
+        # The control step begins where it did for the policy's own action.
+        before = Course(end=memory.course.start)
+        course = self.controller.course_of(before, memory.measured["joint_angles"], values)
         self._memory = memory._replace(course=course)
         return self.targets
 
@@ -265,7 +266,7 @@ class DeployedPolicy:
         """The measurements of which the network's inputs are made, but those with a default."""
         reads = self._network.reads
         metadata = self._network.metadata
-        names = (*MEASURED, *metadata.goals)
+        names = (*_MEASURED, *metadata.goals)
         inputs_of = {name: {name} for name in names}
         inputs_of["joint_angles"] |= {"paddle_position", "servo_lead"}
         inputs_of["ball_position"].add("ball_picture")

@@ -30,6 +30,12 @@ class Target(NamedTuple):
 class Unknown(Exception):
     """Why it is not known where the arm rests."""
 
+    def __init__(self, reason: str, fault: str = "joint_astray"):
+        super().__init__(reason)
+        self.fault = fault
+        """Code of an arm that is so for longer than it takes to settle, of the table in
+        docs/real-robot.md."""
+
 
 def follow_target(target: Target, measured: Measurements) -> Target:
     """The controller's target with a new sample."""
@@ -101,7 +107,8 @@ def check_tool(metadata: Metadata, measured: Measurements) -> None:
             raise Unknown(
                 f"the controller has the paddle at {_vector(given)} m, {off:.2g} m from where "
                 f"{metadata.robot} has it at these angles, {_vector(own)}; check that the policy "
-                "is of this arm, the joints' signs, zeros and order, and the tool's centre point"
+                "is of this arm, the joints' signs, zeros and order, and the tool's centre point",
+                "tool",
             )
     if "tool_normal" in measured:
         given = measured["tool_normal"]
@@ -112,7 +119,8 @@ def check_tool(metadata: Metadata, measured: Measurements) -> None:
             raise Unknown(
                 f"the controller has the paddle's normal {tilt:.2g} rad from that of "
                 f"{metadata.robot} at these angles; check that the policy is of this arm, the "
-                "joints' signs, zeros and order, and the tool's orientation"
+                "joints' signs, zeros and order, and the tool's orientation",
+                "tool",
             )
 
 

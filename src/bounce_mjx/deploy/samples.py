@@ -3,8 +3,9 @@
 A sample that cannot be true is bridged, the last values hold, while at most a third of the last
 0.1 s are such; then the sample is refused. What no other sample can make true is refused at once:
 first angles of an arm that is elsewhere, a range that the arm has left little by little, a clock
-that stands or has jumped by a second, a picture of the future. Each reason here is a row of the
-table in docs/real-robot.md. What is no number at all is refused before (`deploy.driver`).
+that has stood for 25 calls or gone back by a second, a picture of the future. Each reason here is a
+row of the table in docs/real-robot.md. What is no number at all is refused before
+(`deploy.driver`).
 
 Nothing here changes: `Samples.take` returns what is known after a sample, and a refused one leaves
 everything as it was.
@@ -16,8 +17,8 @@ from typing import NamedTuple
 import numpy as np
 
 from bounce_mjx.deploy.clock import MOST_STANDING, Clock, advance, is_pause
-from bounce_mjx.deploy.flight import Flight, begin, flight_bounds, follow
-from bounce_mjx.deploy.metadata import Metadata, joint_ends, largest_term
+from bounce_mjx.deploy.flight import Flight, begin, flight_bounds, follow, may_lie
+from bounce_mjx.deploy.metadata import Metadata, joint_ends, largest_term, least_term
 from bounce_mjx.deploy.motion import paddle_position
 from bounce_mjx.errors import UserError
 
@@ -37,6 +38,10 @@ _BRIDGED_PICTURES = 4.0
 # Pictures of the same position are two if they are farther apart than this share of a control step:
 # the newest ones of two steps are half of it apart or more, whatever the camera's rate.
 _APART = 0.4
+# The same of pictures without an age, of a ball that may lie still, in the training's longest
+# intervals between two, and at least, s: sooner, there may have been none.
+_STILL_FOR = 3.0
+_LEAST_STILL = 0.05
 # Time in which velocities and angles are compared, s; the least way that counts, rad, how much
 # later the velocities may be, s, and their errors as a share of the way.
 _COMPARED = 0.1
@@ -71,11 +76,17 @@ class ImpossibleMeasurement(UserError):
         """Code of what is wrong, of the table in docs/real-robot.md."""
 
 
-class Doubt(NamedTuple):
-    """Why a sample cannot be true."""
+class Doubt(Exception):
+    """Why a sample cannot be true: it is bridged, or refused."""
 
-    fault: str
-    reason: str
+    def __init__(self, fault: str, reason: str):
+        super().__init__(reason)
+        self.fault = fault
+        """Code, as of `ImpossibleMeasurement`."""
+
+    def refused(self) -> ImpossibleMeasurement:
+        """The same of a sample that is refused."""
+        return ImpossibleMeasurement(self.fault, str(self))
 
 
 class Bridge(NamedTuple):
@@ -150,9 +161,12 @@ class Samples:
         self._velocity_noise = _LARGEST_NOISE * largest_term(metadata, "joint_velocity_noise")
         self._low, self._high = joint_ends(metadata)
         self._start = np.array(metadata.default_joint_angles)
-        self._start_room = _NEAR + metadata.start_noise
+        self.start_room = _NEAR + metadata.start_noise
+        """Distance of a resting arm from its start pose where nobody says where it rests, rad."""
         self._still = np.zeros(len(self._start))
         self._flight = flight_bounds(metadata)
+        slowest = least_term(metadata, "camera_rate", 1.0 / metadata.control_dt)
+        self._still_for = max(_STILL_FOR / slowest, _LEAST_STILL)
 
     def take(
         self,
@@ -245,8 +259,9 @@ class Samples:
         if "joint_angles" not in seen.values:
             self.check_first(angles, rests_at)
             seen = self.rest(seen, angles)
-        doubt, moved = self._doubt_of_arm(seen, measured)
-        if doubt is not None:
+        try:
+            moved = self._moved(seen, measured)
+        except Doubt as doubt:
             return self._bridge_values(seen, measured, "arm", _OF_ARM, doubt, elapsed)
         seen = self._believe(seen, measured, _OF_ARM)
         now = seen.clock.now
@@ -259,10 +274,12 @@ class Samples:
             paddle=_recent(seen.paddle + way, now - _PADDLE_WAY),
         )
 
-    def _doubt_of_arm(
-        self, seen: Seen, measured: Measurements
-    ) -> tuple[Doubt | None, tuple[Moved, ...]]:
-        """What speaks against the arm's sample, and its motion with it."""
+    def _moved(self, seen: Seen, measured: Measurements) -> tuple[Moved, ...]:
+        """The arm's motion with a sample.
+
+        Raises:
+          Doubt: something speaks against the sample.
+        """
         angles = measured["joint_angles"]
         last = seen.values["joint_angles"]
         elapsed = max(seen.clock.now - seen.arm_time, self._dt)
@@ -277,11 +294,11 @@ class Samples:
                 f"{change[joint]:.3g} rad from {1e3 * elapsed:.0f} ms before, "
                 f"farther than it moves; {remedy}"
             )
-            return Doubt("joint_jump", reason), seen.moved
+            raise Doubt("joint_jump", reason)
         # Not left by a jump, so that the next sample will say the same.
         self.check_range("angle", angles)
         if "joint_velocities" not in measured:
-            return None, ()
+            return ()
         velocities = measured["joint_velocities"]
         speeds = np.abs(velocities)
         too_fast = speeds - self._fastest
@@ -291,28 +308,32 @@ class Samples:
                 f"{self._metadata.joint_names[joint]} has {velocities[joint]:.3g} rad/s, and moves "
                 f"at most at {self._fastest[joint]:.3g} (rad/s); stop the arm"
             )
-            return Doubt("joint_speed", reason), seen.moved
+            raise Doubt("joint_speed", reason)
         return self._compare_velocities(seen, angles, velocities, speeds)
 
     def _compare_velocities(
         self, seen: Seen, angles: np.ndarray, velocities: np.ndarray, speeds: np.ndarray
-    ) -> tuple[Doubt | None, tuple[Moved, ...]]:
-        """What speaks against the velocities [J], whose integral is the way of the angles [J]."""
+    ) -> tuple[Moved, ...]:
+        """The arm's motion with velocities [J], whose integral is the way of the angles [J].
+
+        Raises:
+          Doubt: it is another way.
+        """
         now = seen.clock.now
         elapsed = now - seen.moved[-1].time if seen.moved else math.inf
         if elapsed > 0.5 * _COMPARED:
             # Nothing is known of the velocities meanwhile.
-            return None, (Moved(now, angles, self._still, speeds),)
+            return (Moved(now, angles, self._still, speeds),)
         last = seen.moved[-1]
         if elapsed < 0.5 * self._dt:
-            return None, seen.moved
+            return seen.moved
         before = seen.values["joint_velocities"]
         way = last.way + 0.5 * elapsed * (before + velocities)
         moved = _recent((*seen.moved, Moved(now, angles, way, speeds)), now - _COMPARED)
         first = moved[0]
         duration = now - first.time
         if duration < 0.5 * _COMPARED:
-            return None, moved
+            return moved
         by_angles = angles - first.angles
         by_velocities = way - first.way
         fastest = np.max([one.speeds for one in moved], axis=0)
@@ -324,14 +345,14 @@ class Samples:
         allowed = allowed + fastest * (_VELOCITY_LAG + self._dt) + _OF_WAY * largest_way
         beyond = np.abs(by_angles - by_velocities) - allowed
         if beyond.max() <= 0.0:
-            return None, moved
+            return moved
         joint = int(np.argmax(beyond))
         reason = (
             f"by its angles {self._metadata.joint_names[joint]} moved {by_angles[joint]:.2g} rad "
             f"in {1e3 * duration:.0f} ms, and by its velocities {by_velocities[joint]:.2g} rad; "
             "give rad/s, each joint's own, with the sign of its angle"
         )
-        return Doubt("joint_speed", reason), moved
+        raise Doubt("joint_speed", reason)
 
     def check_range(self, label: str, angles: np.ndarray) -> None:
         """Refuses angles [J] (rad) far outside of their ranges. Whole turns are not removed: a
@@ -365,7 +386,7 @@ class Samples:
         """
         self.check_range("angle", angles)
         place = self._start if rests_at is None else rests_at
-        room = self._start_room if rests_at is None else _NEAR
+        room = self.start_room if rests_at is None else _NEAR
         away = np.abs(angles - place)
         joint = int(np.argmax(away))
         if away[joint] <= room:
@@ -395,35 +416,54 @@ class Samples:
         last = seen.picture
         taken = seen.clock.now - (age or 0.0)
         is_new = last is None or bool((balls != last.balls).any())
-        if not is_new and age is not None:
-            is_new = taken > last.taken + _APART * self._dt
-        doubt = self._doubt_of_velocity(measured)
+        if not is_new:
+            is_new = self._is_later(seen, taken - last.taken, has_age=age is not None)
         flights = seen.flights
-        if doubt is None and is_new:
-            doubt, flights = self._follow(seen, balls, taken)
-        if doubt is not None:
+        try:
+            self._check_velocity(measured)
+            if is_new:
+                flights = self._follow(seen, balls, taken)
+        except Doubt as doubt:
             return self._bridge_values(seen, measured, "ball", _OF_BALL, doubt, elapsed)
         if is_new:
             interval = self._dt if last is None else taken - last.taken
             seen = seen._replace(picture=Picture(balls, taken, interval), flights=flights)
         return self._believe(seen, measured, _OF_BALL)
 
-    def _doubt_of_velocity(self, measured: Measurements) -> Doubt | None:
+    def _is_later(self, seen: Seen, later: float, has_age: bool) -> bool:
+        """Whether a place that repeats is that of another picture.
+
+        Args:
+          later: by how much it was taken later, or came later, s.
+          has_age: whether it is known when it was taken; if not, only balls that may lie where they
+            are repeat their place.
+        """
+        if has_age:
+            return later > _APART * self._dt
+        if later < self._still_for or not seen.paddle:
+            return False
+        paddle = seen.paddle[-1][1]
+        return all(may_lie(self._flight, ball, paddle) for ball in seen.picture.balls)
+
+    def _check_velocity(self, measured: Measurements) -> None:
+        """Raises Doubt for balls that are too fast."""
         if "ball_velocity" not in measured:
-            return None
+            return
         speed = _longest(measured["ball_velocity"].reshape(-1, 3))
         if speed <= self._flight.speed:
-            return None
-        return Doubt(
+            return
+        raise Doubt(
             "ball_speed",
             f"the ball has {speed:.3g} m/s, but the training had at most "
             f"{self._flight.speed:.3g} (m/s); give this unit",
         )
 
-    def _follow(
-        self, seen: Seen, balls: np.ndarray, taken: float
-    ) -> tuple[Doubt | None, tuple[Flight, ...]]:
-        """What speaks against a new picture of the balls [B, 3], and their flights with it."""
+    def _follow(self, seen: Seen, balls: np.ndarray, taken: float) -> tuple[Flight, ...]:
+        """The flights with a new picture of the balls [B, 3].
+
+        Raises:
+          Doubt: something speaks against the picture.
+        """
         farthest = self._metadata.ball.distance
         distance = _longest(balls)
         if distance > farthest:
@@ -431,19 +471,19 @@ class Samples:
                 f"the distance of ball_position is {distance:.3g}, but the training had 0 to "
                 f"{farthest:.3g} (m); give this unit, and the robot's frame"
             )
-            return Doubt("ball_place", reason), seen.flights
+            raise Doubt("ball_place", reason)
         last = seen.picture
         if last is not None and taken < last.taken - self._dt:
             reason = (
                 f"the picture of the ball was taken {1e3 * (last.taken - taken):.0f} ms before the "
                 "last one; give the newest, and ages by one clock"
             )
-            return Doubt("old_picture", reason), seen.flights
+            raise Doubt("old_picture", reason)
         if not seen.paddle:
-            return None, ()
+            return ()
         paddle = _at(seen.paddle, taken)
         if not seen.flights:
-            return None, tuple(begin(taken, ball, paddle) for ball in balls)
+            return tuple(begin(taken, ball, paddle) for ball in balls)
         # Times of pictures differ from the truth, but not their order.
         taken = max(taken, seen.flights[0].times[-1] + 1e-3)
         flights = []
@@ -456,9 +496,9 @@ class Samples:
                     f"the ball, {place}, {reason}; check the camera, and that nothing else looks "
                     "like the ball and nobody holds it"
                 )
-                return Doubt("ball_flight", reason), seen.flights
+                raise Doubt("ball_flight", reason)
             flights.append(following)
-        return None, tuple(flights)
+        return tuple(flights)
 
     def _believe(self, seen: Seen, measured: Measurements, names: tuple[str, ...]) -> Seen:
         values = {name: measured[name] for name in names if name in measured}
@@ -481,7 +521,7 @@ class Samples:
           elapsed: time for which the sample counts, s.
         """
         if names[0] not in seen.values:
-            raise ImpossibleMeasurement(*doubt)
+            raise doubt.refused()
         seen = self._bridge(seen, kind, doubt, elapsed)
         for name in names:
             if measured.pop(name, None) is None:
@@ -507,7 +547,7 @@ class Samples:
             tuple(times[place] for place in kept), tuple(durations[place] for place in kept)
         )
         if sum(bridge.durations) > window / 3.0 + 1e-9:
-            raise ImpossibleMeasurement(*doubt)
+            raise doubt.refused()
         return seen._replace(bridges=seen.bridges | {kind: bridge})
 
 

@@ -16,7 +16,7 @@ from bounce_mjx.deploy.controller import Controller, Memory
 from bounce_mjx.deploy.driver import LARGEST, Driver
 from bounce_mjx.deploy.faults import Fault, Followed, Watch, check_balls, picture_age
 from bounce_mjx.deploy.metadata import Metadata
-from bounce_mjx.deploy.motion import paddle_position
+from bounce_mjx.deploy.motion import Course, paddle_position
 from bounce_mjx.deploy.rest import (
     Target,
     Unknown,
@@ -36,9 +36,6 @@ _HOME_TOLERANCE = 2e-3
 _HOME_SPEED = 0.3
 # In which an arm comes to rest where its commands do, s.
 _SETTLING = 1.0
-# What the first angles may be off the start pose, where nobody says where the arm rests, beside the
-# noise of a start, rad.
-_NEAR = 0.1
 # Horizontal distance of a ball from the paddle's centre at which it is over the paddle, m.
 _OVER = 0.15
 # Measured of the arm alone.
@@ -54,6 +51,21 @@ class Stop(NamedTuple):
     """Whether the commands rest."""
 
 
+class Place(NamedTuple):
+    """Where an arm is to be measured before anything is sent."""
+
+    angles: np.ndarray
+    """[J], rad."""
+    words: str
+    """The same in words."""
+    room: float
+    """Distance of a joint that is no error, rad."""
+    course: Course
+    """Commands that begin there."""
+    is_said: bool = True
+    """Whether the operator, the controller or the last commands say it."""
+
+
 class Progress(NamedTuple):
     """What a supervisor knows between two calls."""
 
@@ -64,8 +76,8 @@ class Progress(NamedTuple):
     has_found_arm: bool = False
     """Whether the arm has been measured where its commands rest; nothing is sent before, nor once
     a stopped arm is elsewhere."""
-    has_begun: bool = False
-    """Whether there was a command, or it is said where the arm rests: nothing is raised then."""
+    may_raise: bool = True
+    """Whether what fails is raised: there was no command, and nobody said where the arm rests."""
     target: Target = Target()
     """The controller's own, before the arm was found."""
     followed: Followed | None = None
@@ -140,7 +152,7 @@ class Supervisor:
         # A stop may come within any other call, from another thread or a signal handler: it is one
         # assignment, which `restart` alone takes back.
         self._stop: Stop | None = None
-        self._progress = Progress(controller.begin(rests_at), has_begun=rests_at is not None)
+        self._progress = Progress(controller.begin(rests_at), may_raise=rests_at is None)
 
     @property
     def state(self) -> State:
@@ -222,7 +234,7 @@ class Supervisor:
         elif moved:
             course = None
         memory = self._controller.episode(Seen(), course)
-        return Progress(memory, has_begun=progress.has_begun)
+        return Progress(memory, may_raise=progress.may_raise)
 
     def commands(self, measurements: Mapping[str, Any]) -> np.ndarray:
         """Commands [M, J] of a control step at the robot's rate, rad; none ([0, J]), so that
@@ -238,8 +250,9 @@ class Supervisor:
             picture is as old as the time since the ball's position last changed.
 
         Raises:
-          Exception: anything fails before the supervisor has given a command, mostly a `UserError`,
-            as the first joint angles are wrong. Afterwards nothing is raised, and the arm brakes.
+          Exception: anything fails before the supervisor has given a command, and nobody said where
+            the arm rests; mostly a `UserError`, as the first joint angles are wrong. In all other
+            cases nothing is raised, and the arm brakes.
         """
         host = time.monotonic()
         progress = self._progress
@@ -248,7 +261,7 @@ class Supervisor:
             try:
                 progress, steps = self._next(progress, measurements, host)
             except Exception as error:
-                if not (progress.has_begun or isinstance(error, Fault)):
+                if progress.may_raise and not isinstance(error, Fault):
                     raise
                 self.stop(*_fault_of(error))
         if self._stop is not None:
@@ -258,7 +271,7 @@ class Supervisor:
         has_commands = course is not None and progress.has_found_arm
         if steps:
             progress = progress._replace(witness=progress.witness._replace(stepped=host))
-        self._progress = progress._replace(has_begun=progress.has_begun or has_commands)
+        self._progress = progress._replace(may_raise=progress.may_raise and not has_commands)
         if steps == 0 or not has_commands:
             return np.zeros((0, len(self._home)))
         return self._driver.to_driver(self._controller.motion.at(course, self._times))
@@ -331,33 +344,19 @@ class Supervisor:
         angles = measured["joint_angles"]
         self._controller.samples.check_range("angle", angles)
         target = follow_target(progress.target, measured)
-        course = memory.course
         progress = progress._replace(memory=memory._replace(seen=seen), target=target)
-        is_place_known = course is not None
         try:
-            if course is not None:
-                place = self._controller.motion.target(course)
-                where = "where its commands rest"
-                room = self._watch.offset
-            else:
-                place = place_of(target, angles)
-                where = "where its controller holds it"
-                room = self._watch.offset
-                is_place_known = place is not None
-                course = self._controller.motion.resting(angles if place is None else place)
-                if place is None:
-                    place = self._home
-                    where = (
-                        "its start pose, and nobody says where the arm rests: give the "
-                        "controller's own joint_targets, or reset(targets)"
-                    )
-                    room = _NEAR + self._metadata.start_noise
-            check_place(self._metadata, angles, place, room, where)
+            place = self._resting_place(progress, angles)
+        except Unknown as unknown:
+            return progress._replace(waits_for=str(unknown), waits_since=None), steps
+        try:
+            check_place(self._metadata, angles, place.angles, place.room, place.words)
             check_tool(self._metadata, measured)
         except Unknown as unknown:
-            if not is_place_known:
+            if not place.is_said:
                 return progress._replace(waits_for=str(unknown), waits_since=None), steps
             return self._wait(progress, unknown), steps
+        course = place.course
         seen = self._controller.samples.rest(seen, angles)
         command = self._controller.motion.target(course)
         progress = progress._replace(
@@ -368,6 +367,27 @@ class Supervisor:
             waits_since=None,
         )
         return self._move_home(progress, angles, max(steps, 1))
+
+    def _resting_place(self, progress: Progress, angles: np.ndarray) -> Place:
+        """Where an arm at angles [J] is said to rest.
+
+        Raises:
+          Unknown: the next samples will say it.
+        """
+        motion = self._controller.motion
+        room = self._watch.offset
+        course = progress.memory.course
+        if course is not None:
+            return Place(motion.target(course), "where its commands rest", room, course)
+        target = place_of(progress.target, angles)
+        if target is not None:
+            return Place(target, "where its controller holds it", room, motion.resting(target))
+        words = (
+            "its start pose, and nobody says where the arm rests: give the controller's own "
+            "joint_targets, or reset(targets)"
+        )
+        room = self._controller.samples.start_room
+        return Place(self._home, words, room, motion.resting(angles), is_said=False)
 
     def _go_home(
         self, progress: Progress, measured: Measurements, waited: float | None
@@ -433,7 +453,7 @@ class Supervisor:
         now = progress.memory.seen.clock.now
         since = now if progress.waits_since is None else progress.waits_since
         if now - since > _SETTLING:
-            raise Fault("joint_astray", str(unknown)) from None
+            raise Fault(unknown.fault, str(unknown)) from None
         return progress._replace(waits_for=str(unknown), waits_since=since)
 
     def _follow(
@@ -443,6 +463,7 @@ class Supervisor:
         controller = self._controller
         command = controller.motion.target(progress.memory.course)
         clock = progress.memory.seen.clock
+        # Before the sample is judged: what a late one shows follows from its lateness.
         late = advance(clock, float(measured["time"][0]), self._dt)[2] - 1
         if late > self._max_steps_late:
             raise Fault("late_step", f"a control step came {late} steps late")

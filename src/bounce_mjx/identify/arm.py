@@ -264,14 +264,16 @@ def _search_arm(
 
 
 def _own_servos(layout: Layout, servos: Servos, delay: float) -> np.ndarray:
-    """Candidates [C, P] with the model's own servos, late as measured (s) by latency and lag."""
+    """Candidates [C, P] with the model's own servos, late as measured (s) by latency and lag, with
+    the dry friction that arms have and with the model's own: a log of the model itself, as of a
+    rehearsal, is so exact that a search from another friction ends elsewhere."""
     rest = max(delay - float(np.mean(servos.delays())), 0.0)
-    return np.stack(
-        [
-            layout.vector({"action_latency": (1.0 - share) * rest, "servo_lag": share * rest})
-            for share in _OWN_LAG_SHARES
-        ]
-    )
+    vectors = []
+    for share in _OWN_LAG_SHARES:
+        late = {"action_latency": (1.0 - share) * rest, "servo_lag": share * rest}
+        vectors.append(layout.vector(late))
+        vectors.append(layout.vector(late | {"joint_frictionloss": servos.frictionloss}))
+    return np.stack(vectors)
 
 
 def _late_servos(layout: Layout, servos: Servos, delay: float) -> np.ndarray:

@@ -23,6 +23,8 @@ class Servos(NamedTuple):
     joint_damping: np.ndarray
     """Of the joint in its bearings and gears [n], N m s / rad, which no gain of the servo
     scales."""
+    frictionloss: np.ndarray
+    """Dry friction of the joint [n], N m."""
 
     def delays(
         self, gain: np.ndarray | float = 1.0, damping: np.ndarray | float = 1.0
@@ -49,4 +51,5 @@ def servos_of(model: mujoco.MjModel) -> Servos:
         stiffness=model.actuator_gainprm[actuators, 0] * squared_gear,
         damping=-model.actuator_biasprm[actuators, 2] * squared_gear,
         joint_damping=model.dof_damping[list(addresses.arm_qvel)],
+        frictionloss=model.dof_frictionloss[list(addresses.arm_qvel)],
     )

@@ -10,6 +10,8 @@ from bounce_mjx.errors import UserError
 
 PPO_NAME = "ppo"
 """Name of the algorithm of this package."""
+NETWORK_KEYS = ("hidden_layers", "critic_layers", "shared_critic", "activation")
+"""Settings that shape the networks."""
 
 
 class PPOConfig(settings.StrictModel):

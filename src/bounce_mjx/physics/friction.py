@@ -10,10 +10,11 @@ the contact feels along it (kg), for a ball on what does not yield 1/m_t = 1/m +
 normal force of the physics step (N). Source: Coulomb's law for the impulse of a time step, e.g.
 Stronge, Impact Mechanics (2000), section 5.1.
 
-Every engine lets its solver compute the normal forces alone, as if the contacts had no friction,
-and gives the impulse after each physics step, with the normals, the levers and the mass matrix of
-the step's start. Several contacts follow in the order of the pairs, each from the slip that the
-last one left. J is never larger than what stops the slip, so that friction never adds energy.
+Each of the three engines (fused, MJX, MuJoCo's C) lets its solver compute the normal forces alone,
+as if the contacts had no friction, and gives the impulse after each physics step, with the normals,
+the levers and the mass matrix of the step's start. Several contacts follow in the order of the
+pairs, each from the slip that the last one left. J is never larger than what stops the slip, so
+that friction never adds energy.
 
 MuJoCo's own friction is another law: physics.md compares the two.
 """

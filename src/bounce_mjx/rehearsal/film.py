@@ -30,7 +30,7 @@ def pictures(
     """
     times = np.array([moved.time for moved in path])
     ball = list(env.addresses.balls[0].qpos[:3])
-    with Renderer(env, *size) as renderer:
+    with Renderer(env, *size, plain=True) as renderer:
         for time in np.arange(times[0], times[-1], 1.0 / fps):
             newest = int(np.searchsorted(times, time))
             oldest = int(np.searchsorted(times, time - _TRAIL))

@@ -7,9 +7,10 @@ which `commands.adopt` prints. A gripper goes whole: what couples its own parts 
 import contextlib
 import importlib.util
 import warnings
-from collections.abc import Container, Iterable, Iterator
+from collections.abc import Container, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
+from xml.etree import ElementTree
 
 import mujoco
 import numpy as np
@@ -49,6 +50,7 @@ _NARROWER = 1e-3
 _HANDLE_RADIUS = 0.011
 # Flags that change how an arm moves where a file disables them; contacts are turned off anyway.
 _FLAGS = "constraint frictionloss limit spring damper gravity clampctrl actuation".split()
+_URDF = ".urdf"
 # How pip installs a package that brings MJCF files, where its name alone is not enough: robosuite
 # without what only its simulations need, at the version whose files have the paths of our configs.
 _INSTALLED_AS = {"robosuite": ("--no-deps", "robosuite==1.5.2")}
@@ -85,6 +87,9 @@ class Arm(NamedTuple):
     file_numbers: dict[str, np.ndarray]
     """`BODY_FIELDS` and `JOINT_FIELDS` of the user's file compiled alone: of the bodies that the
     scene has too, and of the acting joints."""
+    velocities: tuple[float, ...] | None
+    """Limit of each acting joint's velocity that a URDF states, rad/s or m/s, which MuJoCo does not
+    read; None of another file, or if a joint has none."""
 
 
 def locate(mjcf: Path) -> Path:
@@ -143,10 +148,48 @@ def build_arm(path: Path, config: RobotConfig) -> Arm:
       UserError: the file does not compile, or holds no arm that can do the task.
     """
     spec = read_spec(path)
+    if path.suffix.lower() == _URDF:
+        # A flange is a link that is fixed to the last one, which MuJoCo would take out.
+        spec.compiler.fusestatic = False
     model = compile_spec(spec, path)
+    changes = []
+    if model.nu == 0 and (driven := _drive(spec, model)):
+        changes.append(
+            "gave each joint an actuator within its own force limit, as the file has none "
+            f"({len(driven)}: {listed(driven)})"
+        )
+        model = compile_spec(spec, path)
     check_numbers(model)
     with _compiling(path):
-        return _Builder(spec, model, config).build()
+        arm = _Builder(spec, model, config, changes).build()
+    return arm._replace(velocities=_stated_velocities(path, arm.joint_names))
+
+
+def _stated_velocities(path: Path, joint_names: Sequence[str]) -> tuple[float, ...] | None:
+    """`Arm.velocities` of a file."""
+    if path.suffix.lower() != _URDF:
+        return None
+    stated = {}
+    for joint in ElementTree.parse(path).getroot().iter("joint"):
+        limit = joint.find("limit")
+        if limit is not None:
+            stated[joint.get("name")] = float(limit.get("velocity", 0.0))
+    velocities = tuple(stated.get(name, 0.0) for name in joint_names)
+    return velocities if all(velocities) else None
+
+
+def _drive(spec: mujoco.MjSpec, model: mujoco.MjModel) -> list[str]:
+    """Adds a motor to each hinge and slide with a force limit of its own, such as a URDF's effort;
+    their names."""
+    driven = []
+    for joint in range(model.njnt):
+        name = model.joint(joint).name
+        is_acting = int(model.jnt_type[joint]) in ACTING_KINDS
+        if name and is_acting and model.jnt_actfrclimited[joint]:
+            motor = spec.add_actuator(target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+            motor.set_to_motor()
+            driven.append(name)
+    return driven
 
 
 def read_spec(path: Path) -> mujoco.MjSpec:
@@ -204,7 +247,7 @@ def naming(path: Path) -> Iterator[None]:
 
 def title(path: Path) -> str:
     """A file by its kind."""
-    return f"the {'URDF' if path.suffix.lower() == '.urdf' else 'MJCF'} file {path}"
+    return f"the {'URDF' if path.suffix.lower() == _URDF else 'MJCF'} file {path}"
 
 
 def find_site(model: mujoco.MjModel, config: RobotConfig) -> tuple[int, np.ndarray, np.ndarray]:
@@ -238,11 +281,18 @@ class _Builder:
     the bodies that it fuses out of the spec.
     """
 
-    def __init__(self, spec: mujoco.MjSpec, model: mujoco.MjModel, config: RobotConfig):
+    def __init__(
+        self,
+        spec: mujoco.MjSpec,
+        model: mujoco.MjModel,
+        config: RobotConfig,
+        changes: Iterable[str],
+    ):
+        """Begins with the changes that were made to the spec before it was compiled."""
         self._spec = spec
         self._model = model
         self._config = config
-        self._changes: list[str] = []
+        self._changes = list(changes)
         self._narrowed: list[str] = []
 
     def build(self) -> Arm:
@@ -272,6 +322,7 @@ class _Builder:
             changes=tuple(self._changes),
             narrowed=tuple(self._narrowed),
             file_numbers=file_numbers,
+            velocities=None,
         )
 
     def _acting_joints(self, chain: list[int]) -> list[int]:
@@ -341,8 +392,7 @@ class _Builder:
         if idle:
             raise UserError(
                 f"no actuator on {listed(idle)}; add a <position> or <motor> with a force limit "
-                "(of a URDF, to the MJCF as which mujoco.MjSpec.from_file(FILE).to_xml() writes "
-                "it), or name the acting joints with --joints"
+                "(to a URDF, an effort), or name the acting joints with --joints"
             )
         return actuators
 

@@ -32,7 +32,7 @@ from bounce_mjx.config.files import differing_keys
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError, reason_of, shorten
 from bounce_mjx.evaluation.results import Report
-from bounce_mjx.learning.config import PPO_NAME, PPOConfig
+from bounce_mjx.learning.config import NETWORK_KEYS, PPO_NAME, PPOConfig
 from bounce_mjx.learning.policy import Actor, Policy, make_networks, networks_of, untrained_policy
 from bounce_mjx.learning.ppo import PPO, Params, names_of_critic_metrics
 from bounce_mjx.learning.registry import find_algorithm
@@ -56,9 +56,6 @@ TRAINING = "training"
 """Item of a checkpoint: what a training continues from."""
 NETWORKS = "networks"
 """Item of a checkpoint: both networks, with which another training can start."""
-
-NETWORK_KEYS = ("hidden_layers", "critic_layers", "shared_critic", "activation")
-"""Keys of `ppo` that shape the networks."""
 
 # Room for the metadata of a checkpoint.
 _MARGIN = 2**20
@@ -168,7 +165,7 @@ def read_networks(
     return stored["params"], stored["statistics"], names
 
 
-def read_start(config: TrainConfig, env: Env) -> tuple[Params, RunningStatistics]:
+def read_warm_start(config: TrainConfig, env: Env) -> tuple[Params, RunningStatistics]:
     """The networks with which a training starts, and the statistics of their inputs.
 
     The value network keeps the critic metrics that both trainings have, by name; to a new one, such
@@ -227,7 +224,7 @@ def read_record(checkpoint: Checkpoint) -> Record:
     run_config = load_run_config(checkpoint.run)
     record = verify(checkpoint)
     try:
-        differing = _differing_keys(run_config, record.config)
+        differing = _keys_unlike(run_config, record.config)
     # Pydantic's own is one.
     except ValueError as error:
         raise DamagedCheckpoint(checkpoint, error) from error
@@ -239,7 +236,7 @@ def read_record(checkpoint: Checkpoint) -> Record:
     return record
 
 
-def _differing_keys(run_config: TrainConfig, stored: dict[str, Any]) -> set[str]:
+def _keys_unlike(run_config: TrainConfig, stored: dict[str, Any]) -> set[str]:
     """The settings of a record, plain, that are not those of its run's config.
 
     Raises:

@@ -1,7 +1,7 @@
 """The settings of a training run, typed, and the reading of a run's own."""
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import pydantic
 import yaml
@@ -50,6 +50,18 @@ def _default_log_dir(known: dict[str, Any]) -> Path:
     return runs_folder(known["env"].task) if "env" in known else Path("runs")
 
 
+def _check_eval_seed(seed: int) -> int:
+    if seed == DEFAULT_SEED:
+        raise ValueError(
+            f"{seed} is the seed of bounce-mjx eval, whose results would be of the episodes by "
+            "which the training chose its best checkpoint; give another"
+        )
+    return seed
+
+
+EvalSeed = Annotated[NonNegativeInt, pydantic.AfterValidator(_check_eval_seed)]
+
+
 class TrainConfig(StrictModel):
     """A training run: the task, the algorithm, the length and the evaluations. `task` is the task's
     name, and `env.task` its class."""
@@ -88,8 +100,8 @@ class TrainConfig(StrictModel):
     screening_episodes: NonNegativeInt = 0
     """Episodes with which an evaluation begins; they double as long as the policy may become the
     best. 0 for all at once."""
-    eval_seed: NonNegativeInt = 10_000
-    """Seed of the evaluations during training."""
+    eval_seed: EvalSeed = 10_000
+    """Seed of the evaluations during training; not that of `bounce-mjx eval`."""
     stop_when_solved: bool = False
     """End once an evaluation meets all results with a margin. Then 64 other episodes should meet
     them too. It ends at the latest with the evaluation after 1.5 times the steps of the first
@@ -113,19 +125,6 @@ class TrainConfig(StrictModel):
             if key:
                 sources[key] = source
         return sources
-
-    def check_eval_seed(self) -> None:
-        """Checks that the training chooses its checkpoint by episodes that are not those of
-        `bounce-mjx eval`.
-
-        Raises:
-          UserError: they are the same.
-        """
-        if self.eval_seed == DEFAULT_SEED:
-            raise UserError(
-                f"eval_seed is {DEFAULT_SEED}, the seed of bounce-mjx eval, whose results would be "
-                "of the episodes by which the training chose its best checkpoint; give another"
-            )
 
     @property
     def training_episode_steps(self) -> int:
@@ -255,7 +254,7 @@ def load_run_config(run: Path) -> TrainConfig:
     values = {"task": DEFAULT} | read_config_file(path)
     values.pop(BASE, None)
     sources = _sources_in(values.pop(SOURCES, None))
-    its_task = task_in(f"the run {run}", values["task"], code_of(run, "task"))
+    its_task = task_named_by(f"the run {run}", values["task"], code_of(run, "task"))
     if not is_code_of(its_task, run, "task"):
         now = code_file_of(its_task)
         warn_once(
@@ -347,7 +346,7 @@ def is_code_of(kind: type, run: Path, key: str) -> bool:
     return copy is None or now is None or copy.read_bytes() == now.content
 
 
-def task_in(source: str, name: str, code: Path | None = None) -> type[Task]:
+def task_named_by(source: str, name: str, code: Path | None = None) -> type[Task]:
     """The task that a file or a run names.
 
     Args:

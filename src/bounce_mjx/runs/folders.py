@@ -1,4 +1,5 @@
-"""Folders of runs and checkpoints, and functions that find them.
+"""Folders of runs and checkpoints, and functions that find them. Everywhere, `run` is the path of a
+run's folder, and of a seed's, which looks like one; `training.run.Run` reads it for a user.
 
     runs/<task>/<time stamp, UTC>/      <task> as in `runs_folder`: that of bounce is bounce_ball
         config.yaml                     the resolved config
@@ -41,7 +42,7 @@ import itertools
 import os
 import re
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -180,11 +181,11 @@ def write_config(run: Path, config: TrainConfig) -> None:
 
 def runs_of_seeds(run: Path) -> list[Path]:
     """Existing folders of a run's seeds, such as seed_003; the run itself if it has one seed."""
-    seeds = []
+    found = []
     for path in run.glob("seed_*"):
         if re.fullmatch("seed_[0-9]+", path.name) and not path.is_symlink():
-            seeds.append(path)
-    return sorted(seeds) or [run]
+            found.append(path)
+    return sorted(found) or [run]
 
 
 @contextlib.contextmanager
@@ -221,9 +222,9 @@ def run_of(path: Path) -> Path:
     """Folder of the run that contains a path; the path may be the folder itself."""
     # Unlike os.path.isdir, Path.is_dir raises an error for a name that is too long.
     if not os.path.isdir(path):
-        near = suggest(str(path), [LATEST])
+        near = suggest(str(path), [LATEST, *POLICIES])
         advice = near or "give a run's folder such as runs/bounce_ball/<time stamp>"
-        raise UserError(f"there is no checkpoint folder {path}; {advice}")
+        raise UserError(f"there is no run and no policy {path}; {advice}")
     for folder in (path, *Path(os.path.abspath(path)).parents):
         if (folder / CONFIG_FILE).is_file():
             return folder
@@ -237,6 +238,19 @@ def is_newest(path: Path | None) -> bool:
     """Whether what the user gives as a run stands for the newest one: nothing, or `LATEST` unless
     there is a folder with that name."""
     return path is None or (str(path) == LATEST and not os.path.isdir(path))
+
+
+def check_newest(paths: Sequence[Path | None]) -> None:
+    """Checks that the newest run is looked for, where the user says in which folder.
+
+    Raises:
+      UserError: each path is that of a run or a policy.
+    """
+    if not any(map(is_newest, paths)):
+        raise UserError(
+            f"--log-dir is where the newest run is looked for, and {paths[0]} is named; omit one "
+            "of them"
+        )
 
 
 def run_or_newest(path: Path | None, log_dir: Path) -> Path:
@@ -384,8 +398,6 @@ def choose_checkpoint(
             raise
         tell(f"no run in {log_dir}: using the policy that comes with the package")
         return find_checkpoint(resource_path(POLICIES[policy]))
-    if not os.path.isdir(run) and (near := suggest(str(path), POLICIES)):
-        raise UserError(f"there is no checkpoint folder and no policy {path}; {near}")
     if run != path:
         results = load_results(_best_seed(run))
         known = results.best.summary if results else "not evaluated"
@@ -442,8 +454,8 @@ def _checkpoints_in(run: Path, place: Path) -> list[Checkpoint]:
 def _best_seed(run: Path) -> Path:
     """Folder of a run's best seed; the run itself if it has one seed."""
     scores = {}
-    for seed in runs_of_seeds(run):
-        results = None if seed == run else load_results(seed)
+    for folder in runs_of_seeds(run):
+        results = None if folder == run else load_results(folder)
         if results is not None:
-            scores[seed] = results.best.score
+            scores[folder] = results.best.score
     return max(scores, key=scores.get, default=run)

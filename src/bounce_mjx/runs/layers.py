@@ -25,65 +25,30 @@ import itertools
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import pydantic
 from pydantic.fields import FieldInfo
 
-from bounce_mjx.config.command_line import Flag
 from bounce_mjx.config.files import differing_keys, flat
-from bounce_mjx.config.settings import Layer, StrictModel, default_of, has_default, merged, nested
+from bounce_mjx.config.settings import default_of, has_default, merged, nested
 from bounce_mjx.config.validation import describe, groups_of, path_of
 from bounce_mjx.errors import UserError, shorten
-from bounce_mjx.learning.config import PPOConfig
+from bounce_mjx.learning.config import NETWORK_KEYS, PPOConfig
 from bounce_mjx.runs.config import (
     DEFAULT_SOURCE,
     RESUMABLE_KEYS,
     TrainConfig,
-    fields_of,
 )
 from bounce_mjx.runs.presets import BASE, SOURCES, preset_files, read_config_file, shown_file
-from bounce_mjx.runs.start import Start, beside_run, find_start
-from bounce_mjx.runs.worlds import layers_of_environment
+from bounce_mjx.runs.start import Choice, FileFlags, Start, check_not_given, find_start
+from bounce_mjx.runs.worlds import Layer, layers_of_environment
 from bounce_mjx.world.named import without_idle_curriculum
 
 FLAGS = "flags"
 """Source of the settings on a command line."""
 PYTHON = "train"
 """Source of the arguments of `train`."""
-
-
-class ChoiceFlags(StrictModel):
-    """The flags that decide which layers there are. The last three are keys of the config, too: the
-    algorithm's class, the policy of a warm start, and where latest is looked for."""
-
-    config: Annotated[tuple[Path, ...], Flag(metavar="NAME|FILE", is_repeated=True)] = ()
-    """Preset, such as cpu or finetune (a YAML file in configs/), or a YAML file of yours. A task's
-    own preset of that name, such as configs/track/cpu.yaml, takes its place. The default is default
-    on an accelerator, and cpu on a CPU. A file of yours lies on that default, or on the preset that
-    its key base names. Given again, each file lies on those before it."""
-    robot: Annotated[Path | None, Flag(metavar="NAME|FILE")] = None
-    """Config of a robot on top of the preset: the file that bounce-mjx adopt wrote, or the name of
-    one in configs/robots/ (ur5e, panda or iiwa)."""
-    world: Annotated[Path | None, Flag(metavar="NAME|FILE")] = None
-    """Named world in place of the preset's: a YAML file, or the name of one in configs/worlds/
-    (ur5e_rtde, panda_fci, iiwa_fri or fast_servo). It may have a robot."""
-    algorithm: str | None = None
-    warm_start: Path | None = None
-    log_dir: Path | None = None
-
-
-class Choice(ChoiceFlags):
-    """What decides which layers there are: the word and the flags of the command, or arguments of
-    `train`."""
-
-    start: Annotated[str | None, Flag(metavar="[TASK|POLICY|RUN]", is_positional=True)] = None
-    """First word: a task (bounce by default, balance, catch, juggle, track, or one of yours, which
-    --import FILE.py names), trained from the start; a policy that comes with the package, such as
-    robust_small, from whose networks a training starts, in its environment; or a run's folder,
-    latest for the newest run, or a checkpoint in it, which continues in place. Of a resumed run,
-    flags may change only total-steps, eval-every, save-every, keep-checkpoints, eval-episodes,
-    screening-episodes, eval-seed, stop-when-solved and num-devices."""
 
 
 # Reading: what lies on what ---------------------------------------------------------------------
@@ -100,61 +65,49 @@ def read_layers(
     Raises:
       UserError: as `find_start` and `layers_on`.
     """
-    start = find_start(
-        choice.start, choice.warm_start, choice.algorithm, choice.log_dir, whole_config
-    )
-    return layers_on(start, choice.config, choice.robot, choice.world, machine, whole_config)
+    return layers_on(find_start(choice.word, choice, whole_config), choice, machine, whole_config)
 
 
 def layers_on(
     start: Start,
-    config: Sequence[Path] = (),
-    robot: Path | None = None,
-    world: Path | None = None,
+    files: FileFlags,
     machine: Path | None = None,
     whole_config: TrainConfig | None = None,
 ) -> "Layers":
     """The layers on a start, without what the user says.
 
     Args:
-      config: presets and files, see `Choice`, as are `robot` and `world`.
       machine: the machine's preset; None asks JAX, which starts its devices.
       whole_config: a config that takes the place of files, and stands alone.
 
     Raises:
-      UserError: a file is missing, wrong, or of another start; or the start has what is given.
+      UserError: a file is missing, wrong, or of another start.
     """
     if start.resumed is not None:
-        given = {"config": config or whole_config, "robot": robot, "world": world}
-        for name, value in given.items():
-            if value:
-                raise beside_run(start.run, name)
+        config = files.config or whole_config
+        given = {"config": config, "robot": files.robot, "world": files.world}
+        check_not_given(start.run, given)
         return Layers(start, (Layer(f"the run {start.run}", start.resumed.model_dump()),))
-    if start.policy is not None and robot is not None:
-        raise UserError(
-            "a warm start and a robot cannot be combined, as the policy brings its arm; leave "
-            "the robot out"
-        )
     machines: list[Layer] = []
     named: list[Layer] = []
     if whole_config is not None:
-        files = [Layer("config", whole_config.model_dump(), whole=("env", "ppo"))]
+        own = [Layer("config", whole_config.model_dump(), whole=("env", "ppo"))]
     else:
-        found = preset_files(config, start.task_name, machine)
+        found = preset_files(files.config, start.task_name, machine)
         machines = _layers_of_files([found.machine])
         named = _layers_of_files([found.named])
-        files = _layers_of_files(found.own)
-        for layer in (*named, *files):
+        own = _layers_of_files(found.own)
+        for layer in (*named, *own):
             _check_start(layer, start)
     changed = _changed_defaults(start.algorithm_config)
     trained = None if start.policy is None else start.policy.env
-    of_env = layers_of_environment(start.task, trained, robot, world)
+    of_env = layers_of_environment(start.task, trained, files.robot, files.world)
     for layer in of_env.robot:
         _check_start(layer, start)
     policies = [_with_networks(layer, start) for layer in of_env.policy]
     return Layers(
         start=start,
-        below=(*machines, *changed, *named, *policies, *files, *of_env.robot, *of_env.world),
+        below=(*machines, *changed, *named, *policies, *own, *of_env.robot, *of_env.world),
         notes=(*start.notes, *_notes(changed, named, "ppo."), *_notes(named, policies, "env.")),
     )
 
@@ -168,24 +121,19 @@ def _check_start(layer: Layer, start: Start) -> None:
       UserError: it is of another task, or of an algorithm or a warm start that the user does not
         name.
     """
-    task = layer.values.get("task", start.task_name)
-    algorithm = layer.values.get("algorithm", start.algorithm_name)
-    warm_start = layer.values.get("warm_start")
-    if task != start.task_name:
-        raise UserError(
-            f"{layer.source} is of the task {task}, and this training of {start.task_name}; give "
-            f"{task} as the first word, or remove the key"
-        )
-    if algorithm != start.algorithm_name and "algorithm" not in start.said:
-        raise UserError(
-            f"{layer.source} is of the algorithm {algorithm}; give --algorithm {algorithm}, or "
-            "remove the key"
-        )
-    if warm_start is not None and start.warm_start is None:
-        raise UserError(
-            f"{layer.source} starts from {warm_start}; give --warm-start {warm_start}, or remove "
-            "the key"
-        )
+    begun = {
+        "task": (start.task_name, "{} as the first word"),
+        "algorithm": (start.algorithm_name, "--algorithm {}"),
+        "warm_start": (start.warm_start, "--warm-start {}"),
+    }
+    for key, (ours, remedy) in begun.items():
+        theirs = layer.values.get(key)
+        wins = key != "task" and key in start.said
+        if theirs is not None and theirs != ours and not wins:
+            raise UserError(
+                f"{layer.source} is of the {key} {theirs}, and this training of {ours or 'none'}; "
+                f"give {remedy.format(theirs)}, or remove the key"
+            )
 
 
 def _layers_of_files(files: Iterable[Path | None]) -> list[Layer]:
@@ -239,8 +187,6 @@ def _as_in_yaml(value: Any) -> Any:
 
 def _with_networks(of_env: Layer, start: Start) -> Layer:
     """The layer of the policy of a warm start: its environment, its task and its networks."""
-    from bounce_mjx.runs.checkpoints import NETWORK_KEYS
-
     networks = start.policy.ppo.model_dump(include={*NETWORK_KEYS, "critic_metrics"})
     values = of_env.values | {"task": start.policy.task, "ppo": networks}
     return of_env._replace(source=f"the warm start {start.warm_start}", values=values)
@@ -262,7 +208,7 @@ class Layers:
     @functools.cached_property
     def fields(self) -> dict[str, FieldInfo]:
         """The settings that there are, by dotted key."""
-        return fields_of(self.start.task.Config, self.start.algorithm_config)
+        return self.start.fields
 
     @property
     def title(self) -> str:
@@ -288,7 +234,7 @@ class Layers:
             run. The error names the layer that set it.
         """
         user_source = PYTHON if flags is None else FLAGS
-        # A start is what it was found to be, such as a checkpoint.
+        # The policy of a warm start is the checkpoint that was found, not the word for it.
         user = self._layer_of_user(user_source, {**(said or {}), **self.start.said})
         above = [*self._beyond_solved(user), user]
         layers = [*self.below, *above]
@@ -479,5 +425,5 @@ def read_preset(
     files = (config,) if isinstance(config, Path) else tuple(config or ())
     for layer in reversed(_layers_of_files(file for file in files if os.path.isfile(file))):
         task = task or layer.values.get("task")
-    choice = Choice(start=task, config=files, robot=robot, world=world)
+    choice = Choice(word=task, config=files, robot=robot, world=world)
     return read_layers(choice, machine).config()

@@ -1,17 +1,74 @@
 """What a training begins with: one word fixes the classes of its settings."""
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
+from pydantic.fields import FieldInfo
+
+from bounce_mjx.config.command_line import Flag
+from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.config.user_code import not_imported, own_name
 from bounce_mjx.errors import UserError, shorten, suggest
 from bounce_mjx.learning.config import PPO_NAME, PPOConfig
 from bounce_mjx.learning.registry import find_algorithm, own_algorithm
 from bounce_mjx.resources import POLICIES, policy_folder
-from bounce_mjx.runs.config import TrainConfig, code_of, is_code_of, load_run_config, runs_folder
+from bounce_mjx.runs.config import (
+    TrainConfig,
+    code_of,
+    fields_of,
+    is_code_of,
+    load_run_config,
+    runs_folder,
+)
 from bounce_mjx.task.registry import DEFAULT, find_task, is_task, registered_tasks, task_name
 from bounce_mjx.task.task import Task
+
+
+class StartFlags(StrictModel):
+    """The flags that decide, with the first word, what a training begins with. They are keys of the
+    config, too: the algorithm's class, the policy of a warm start, and where latest is looked
+    for."""
+
+    algorithm: str | None = None
+    warm_start: Path | None = None
+    log_dir: Path | None = None
+
+
+class FileFlags(StrictModel):
+    """The files whose values lie on the start."""
+
+    config: Annotated[tuple[Path, ...], Flag(metavar="NAME|FILE", is_repeated=True)] = ()
+    """Preset, such as cpu or finetune (a YAML file in configs/), or a YAML file of yours. A task's
+    own preset of that name, such as configs/track/cpu.yaml, takes its place. The default is default
+    on an accelerator, and cpu on a CPU. A file of yours lies on that default, or on the preset that
+    its key base names. Given again, each file lies on those before it."""
+    robot: Annotated[Path | None, Flag(metavar="NAME|FILE")] = None
+    """Config of a robot on top of the preset: the file that bounce-mjx adopt wrote, or the name of
+    one in configs/robots/ (ur5e, panda or iiwa)."""
+    world: Annotated[Path | None, Flag(metavar="NAME|FILE")] = None
+    """Named world in place of the preset's: a YAML file, or the name of one in configs/worlds/
+    (ur5e_rtde, panda_fci, iiwa_fri or fast_servo). It may have a robot."""
+
+
+class ChoiceFlags(StartFlags, FileFlags):
+    """The flags that decide which layers there are."""
+
+
+class Choice(ChoiceFlags):
+    """The first word and those flags: all that decides which layers there are."""
+
+    word: Annotated[
+        str | None,
+        Flag(metavar="[TASK|POLICY|RUN]", is_positional=True, instead_of=("--task", "--resume")),
+    ] = None
+    """First word: a task (bounce by default, balance, catch, juggle, track, or one of yours, which
+    --import FILE.py names), trained from the start; a policy that comes with the package, such as
+    robust_small, from whose networks a training starts, in its environment; or a run's folder,
+    latest for the newest run, or a checkpoint in it, which continues in place. Of a resumed run,
+    flags may change only total-steps, eval-every, save-every, keep-checkpoints, eval-episodes,
+    screening-episodes, eval-seed, stop-when-solved and num-devices."""
 
 
 class Start(NamedTuple):
@@ -23,7 +80,8 @@ class Start(NamedTuple):
     """Type of the settings of the algorithm."""
     algorithm_name: str
     said: dict[str, Any]
-    """What the user says by it, by keys of the config."""
+    """What the user names of it, by the keys of the config: the task, the algorithm, the policy of
+    a warm start. It wins over every layer."""
     policy: TrainConfig | None = None
     """Config of the policy of a warm start."""
     warm_start: Path | None = None
@@ -35,68 +93,63 @@ class Start(NamedTuple):
     notes: tuple[str, ...] = ()
     """Which run latest stands for."""
 
+    @property
+    def fields(self) -> dict[str, FieldInfo]:
+        """The settings that a training from here has, by dotted key."""
+        return fields_of(self.task.Config, self.algorithm_config)
+
 
 def find_start(
-    word: str | None = None,
-    warm_start: Path | None = None,
-    algorithm: str | None = None,
-    log_dir: Path | None = None,
-    whole_config: TrainConfig | None = None,
+    word: str | None, flags: StartFlags, whole_config: TrainConfig | None = None
 ) -> Start:
-    """What a word means: a task, a policy or a run; and what is said beside it.
+    """What the first word means: a task, a policy or a run; and what is said beside it.
 
     Args:
-      warm_start: a policy or a run from whose networks the training starts.
-      algorithm: its name; by default, ppo.
-      log_dir: where the newest run is looked for first.
+      word: None for the default task, or that of a warm start.
       whole_config: whose task and algorithm these are, in place of a word.
 
     Raises:
       UserError: there is no such thing, or two of these exclude each other.
     """
-    if word is not None and not is_task(word):
-        # Imports JAX, which a task's help does not need.
-        from bounce_mjx.runs.folders import LATEST, is_newest
+    if word is None or is_task(word):
+        return _new_start(word, flags.warm_start, flags, whole_config)
+    if policy_folder(word):
+        if flags.warm_start is not None:
+            raise UserError(
+                f"{word} and the warm start {flags.warm_start} are two policies; leave one out"
+            )
+        return _new_start(None, Path(word), flags, whole_config)
+    # Imports JAX, which a task's help does not need.
+    from bounce_mjx.runs.folders import LATEST, is_newest
 
-        if policy_folder(word):
-            if warm_start is not None:
-                raise UserError(
-                    f"{word} and the warm start {warm_start} are two policies; leave one out"
-                )
-            warm_start, word = Path(word), None
-        elif is_newest(Path(word)) or os.path.isdir(word):
-            for name, given in {"warm_start": warm_start, "algorithm": algorithm}.items():
-                if given is not None:
-                    raise beside_run(word, name)
-            return _start_of_run(Path(word), log_dir)
-        else:
-            known = list(dict.fromkeys((*registered_tasks(), *POLICIES)))
-            own = "a run's folder, or --import FILE.py for a task of your own"
-            advice = suggest(word, [*known, LATEST]) or f"give {', '.join(known)}, {own}"
-            raise UserError(f"there is no task, policy or run {shorten(word)}; {advice}")
+    if is_newest(Path(word)) or os.path.isdir(word):
+        return _start_of_run(Path(word), flags)
+    known = list(dict.fromkeys((*registered_tasks(), *POLICIES)))
+    own = "a run's folder, or --import FILE.py for a task of your own"
+    advice = suggest(word, [*known, LATEST]) or f"give {', '.join(known)}, {own}"
+    raise UserError(f"there is no task, policy or run {shorten(word)}; {advice}")
+
+
+def _new_start(
+    word: str | None, warm_start: Path | None, flags: StartFlags, whole_config: TrainConfig | None
+) -> Start:
+    """The start of a new run.
+
+    Args:
+      word: the task, if the user names it.
+      warm_start: the policy from whose networks and environment it starts.
+    """
+    said: dict[str, Any] = {}
     policy, notes = None, ()
     if warm_start is not None:
-        folder = _folder_of_runs(log_dir, word, whole_config)
+        folder = _folder_of_runs(flags.log_dir, word, whole_config)
         warm_start, policy, notes = _policy_of(warm_start, folder)
-    said: dict[str, Any] = {}
-    if word is not None:
-        task = find_task(word)
-        said["task"] = task_name(task)
-    elif whole_config is not None:
-        task = whole_config.env.task
-    elif policy is not None:
-        task = policy.env.task
-    else:
-        task = find_task(DEFAULT)
-    if whole_config is not None and whole_config.env.task is not task:
-        raise UserError(
-            f"the config is of the task {whole_config.task}, and the first argument is {word}; "
-            "leave it out"
-        )
-    if warm_start is not None:
         said["warm_start"] = warm_start
-    algorithm_name, settings = _algorithm(algorithm, whole_config)
-    if algorithm is not None:
+    task = _task_of(word, whole_config, policy)
+    if word is not None:
+        said["task"] = task_name(task)
+    algorithm_name, settings = _algorithm(flags.algorithm, whole_config)
+    if flags.algorithm is not None:
         said["algorithm"] = algorithm_name
     return Start(
         task=task,
@@ -110,23 +163,50 @@ def find_start(
     )
 
 
-def beside_run(run: str | os.PathLike, name: str) -> UserError:
-    """The refusal of what a run has already, with which it is resumed."""
-    return UserError(
-        f"the run {run} has its {name}, with which it is resumed; leave {name} out, or start a new "
-        f"run from its networks: --warm-start {run}"
-    )
+def _task_of(
+    word: str | None, whole_config: TrainConfig | None, policy: TrainConfig | None
+) -> type[Task]:
+    """The task that the word names; without one, that of a whole config, of the policy of a warm
+    start, or the default.
 
-
-def _start_of_run(word: Path, log_dir: Path | None) -> Start:
-    """The start of a run that is resumed."""
-    from bounce_mjx.runs.folders import is_newest, run_of, run_or_newest
-
-    if log_dir is not None and not is_newest(word):
+    Raises:
+      UserError: the word names another task than a whole config.
+    """
+    if word is None:
+        config = whole_config or policy
+        return find_task(DEFAULT) if config is None else config.env.task
+    task = find_task(word)
+    if whole_config is not None and whole_config.env.task is not task:
         raise UserError(
-            f"log_dir is where the newest run is looked for, and {word} is named; omit one of them"
+            f"the config is of the task {whole_config.task}, and the first argument is {word}; "
+            "leave it out"
         )
-    place = run_or_newest(word, log_dir or runs_folder(find_task(DEFAULT)))
+    return task
+
+
+def check_not_given(run: Path, given: Mapping[str, Any]) -> None:
+    """Checks that nothing is given of what a run has already, with which it is resumed.
+
+    Raises:
+      UserError: something is.
+    """
+    for name, value in given.items():
+        if value:
+            raise UserError(
+                f"the run {run} has its {name}, with which it is resumed; leave {name} out, or "
+                f"start a new run from its networks: --warm-start {run}"
+            )
+
+
+def _start_of_run(word: Path, flags: StartFlags) -> Start:
+    """The start of a run that is resumed."""
+    from bounce_mjx.runs.folders import check_newest, run_of, run_or_newest
+
+    if flags.log_dir is not None:
+        check_newest([word])
+    check_not_given(word, {"algorithm": flags.algorithm, "warm_start": flags.warm_start})
+    # Without a folder, latest is the newest run of the default task.
+    place = run_or_newest(word, flags.log_dir or runs_folder(find_task(DEFAULT)))
     run = run_of(place)
     config = load_run_config(run)
     classes: dict[str, type] = {"task": config.env.task}
@@ -161,8 +241,8 @@ def _policy_of(path: Path, log_dir: Path) -> tuple[Path, TrainConfig, tuple[str,
 
     notes: list[str] = []
     checkpoint = choose_checkpoint(path, log_dir, notes.append)
-    start = path if policy_folder(path) else checkpoint.folder
-    return start, load_run_config(checkpoint.run), tuple(notes)
+    place = path if policy_folder(path) else checkpoint.folder
+    return place, load_run_config(checkpoint.run), tuple(notes)
 
 
 def _folder_of_runs(

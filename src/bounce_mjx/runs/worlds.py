@@ -1,17 +1,17 @@
 """The environment of a task, or of a policy's training, in a world: `env_in_world`.
 
-Its settings are layers, the lowest first: what the policy was trained in, its robot, and its world
-(`layers_of_environment`). A training has further layers between them (`runs/layers.py`).
+Its settings are layers (`Layer`), the lowest first: what the policy was trained in, its robot, and
+its world (`layers_of_environment`). A training has further layers between them (`runs/layers.py`).
 """
 
 import os
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from bounce_mjx.config.settings import Layer, merged
+from bounce_mjx.config.settings import merged
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError
-from bounce_mjx.runs.config import task_in
+from bounce_mjx.runs.config import task_named_by
 from bounce_mjx.runs.presets import ROBOTS, WORLDS, named_file, read_config_file, shown_file
 from bounce_mjx.task.registry import DEFAULT
 from bounce_mjx.task.task import Task
@@ -29,6 +29,21 @@ NOMINAL = "nominal"
 World = str | os.PathLike | RandomizationConfig | None
 """`AS_TRAINED`, `TRAINING` or `NOMINAL`; the file of a named world, or its name in configs/worlds/;
 or, of a policy, the terms of a user's own."""
+
+
+class Layer(NamedTuple):
+    """The settings of one source."""
+
+    source: str
+    """For people, such as configs/cpu.yaml."""
+    values: dict[str, Any]
+    """Nested, with the keys of `TrainConfig`."""
+    is_world: bool = False
+    """Whether it replaces all terms of the randomisation. A preset's curriculum of terms that this
+    world does not have is dropped (`without_idle_curriculum`)."""
+    whole: tuple[str, ...] = ()
+    """Dotted keys of what it brings whole: also of a mapping, such as `shares`, nothing remains of
+    the layers below."""
 
 
 class EnvironmentLayers(NamedTuple):
@@ -54,10 +69,11 @@ def env_in_world(
       robot: of a task: a file, or a name in configs/robots/.
 
     Raises:
-      UserError: the robot or the world is missing or wrong, the world is of another robot, a term
-        does not fit the arm, or a task has no training's worlds.
+      UserError: the robot or the world is missing or wrong, the world is of another robot, a policy
+        or a term does not fit the arm, or a task has no training's worlds.
     """
     if isinstance(start, WorldConfig):
+        _check_one_robot(start, robot)
         if world is AS_TRAINED:
             return start
         if world == NOMINAL:
@@ -77,6 +93,14 @@ def env_in_world(
         )
     named = None if world in (AS_TRAINED, NOMINAL) else Path(world)
     return _merged(start.Config, layers_of_environment(start, None, robot, named))
+
+
+def _check_one_robot(trained: WorldConfig | None, robot: Path | None) -> None:
+    """Raises UserError for a robot beside that of a policy or a config."""
+    if trained is not None and robot is not None:
+        raise UserError(
+            f"the robot {robot} is given, and a policy or a config brings its own; leave robot out"
+        )
 
 
 def _merged(config_class: type[WorldConfig], layers: EnvironmentLayers) -> WorldConfig:
@@ -102,6 +126,7 @@ def layers_of_environment(
     Raises:
       UserError: one of them is missing or wrong, or the world is of another robot.
     """
+    _check_one_robot(trained, robot)
     policies = [] if trained is None else [_layer_of_policy(trained, world is not None)]
     robots = []
     if robot is not None:
@@ -184,7 +209,7 @@ def _robot_of(world: NamedWorld, path: Path) -> Path:
 def _read_robot(robot: Path) -> tuple[dict[str, Any], type[Task], WorldConfig]:
     """The values of a robot's config but for its task, that task, and its environment."""
     values = read_config_file(robot, "robot's config file", f"{ROBOTS}/ur5e.yaml")
-    task = task_in(str(robot), values.pop("task", DEFAULT))
+    task = task_named_by(str(robot), values.pop("task", DEFAULT))
     return values, task, validate(task.Config, values.get("env", {}), str(robot), "env")
 
 

@@ -122,7 +122,7 @@ def open_job(
     env = Env(config.env)
     trainer = make_trainer(config, env)
     is_warm = config.warm_start is not None and resume is None
-    networks = checkpoints.read_start(config, env) if is_warm else None
+    networks = checkpoints.read_warm_start(config, env) if is_warm else None
     # Before, a signal ends the process by its default action.
     stop = stack.enter_context(StopRequest())
     run = _make_run(config) if resume is None else folders.run_of(resume)
@@ -194,7 +194,7 @@ class Job:
     """Whether the run is not resumed."""
     networks: Any
     """Parameters of both networks of a warm start and the statistics of their inputs, as from
-    `checkpoints.read_start`; None without one."""
+    `checkpoints.read_warm_start`; None without one."""
     console: Console
     callbacks: list[Any]
     pool: concurrent.futures.Executor
@@ -228,9 +228,9 @@ class Job:
         self.eval_steps = rounded_steps["eval_every"]
         self.save_steps = rounded_steps.get("save_every")
         self.seeds = []
-        for seed in range(config.seed, config.seed + config.num_seeds):
-            folder = self.run / f"seed_{seed:03d}" if config.num_seeds > 1 else self.run
-            alone = config.model_copy(update={"seed": seed, "num_seeds": 1})
+        for number in range(config.seed, config.seed + config.num_seeds):
+            folder = self.run / f"seed_{number:03d}" if config.num_seeds > 1 else self.run
+            alone = config.model_copy(update={"seed": number, "num_seeds": 1})
             self.seeds.append(SeedRun(folder, alone, self.clock.seconds))
         self.saver = Saver(self.run, config, self.seeds, self.pool, self.say)
 
@@ -271,11 +271,15 @@ class Job:
                     self.say(f"the damaged checkpoint is kept as {aside}")
 
     def write_configs(self) -> None:
-        """Makes the folders of the seeds, and writes the config of each and of the run, which has
-        changed where it is resumed with more steps."""
+        """Makes the folders of the seeds, and writes the config of each, and of a resumed run,
+        whose length may have changed."""
         if not hosts.is_leader():
             return
-        for folder, config in self.configs_by_folder().items():
+        configs = self.configs_by_folder()
+        if self.is_new:
+            # `create_run` has written it.
+            del configs[self.run]
+        for folder, config in configs.items():
             with writable(folder, "make room there or make it writable"):
                 folder.mkdir(exist_ok=True)
                 folders.save_config(folder, config)
@@ -404,7 +408,7 @@ class Job:
         """
         self.snapshot = None
         started = time.perf_counter()
-        block = self.pool.submit(self.trainer.run)
+        block = self.pool.submit(self.trainer.train_block)
         if not self.stop.wait_for(block):
             self.say("stopping after this block; Ctrl-C or SIGTERM ends it at once")
         metrics = block.result()

@@ -131,7 +131,7 @@ class PPOTrainer:
             warm = initial._replace(params=params, statistics=statistics)
             self.state = hosts.distribute(warm, self._sharding)
 
-    def run(self) -> BlockMetrics:
+    def train_block(self) -> BlockMetrics:
         """Trains for a block of I iterations.
 
         Returns:

@@ -16,6 +16,7 @@ import jax
 from rich.console import Console
 
 from bounce_mjx.config.command_line import stdout
+from bounce_mjx.config.validation import validate
 from bounce_mjx.deploy.environments import environment
 from bounce_mjx.deploy.interface import check_interface, interface_of
 from bounce_mjx.deploy.wrappers import environments_in, in_library
@@ -32,7 +33,7 @@ from bounce_mjx.runs.checkpoints import read_actor
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.layers import FLAGS, PYTHON, Layers, layers_on
 from bounce_mjx.runs.progress import load_results
-from bounce_mjx.runs.start import find_start
+from bounce_mjx.runs.start import FileFlags, StartFlags, find_start
 from bounce_mjx.task.registry import task_name
 from bounce_mjx.task.task import Task
 from bounce_mjx.training import hosts, job
@@ -194,31 +195,15 @@ def train(
         files = (config,)
     elif whole is None:
         files = config
-    begun = find_start(
-        word,
-        _as_path("warm_start", warm_start),
-        settings.get("algorithm"),
-        _as_path("log_dir", settings.get("log_dir")),
-        whole,
-    )
-    layers = layers_on(
-        begun,
-        [_as_path("config", file) for file in files],
-        _as_path("robot", robot),
-        _as_path("world", world),
-        whole_config=whole,
-    )
+    of_start = {key: settings[key] for key in ("algorithm", "log_dir") if key in settings}
+    of_start["warm_start"] = warm_start
+    begun = find_start(word, validate(StartFlags, of_start, PYTHON), whole)
+    given = {"config": files, "robot": robot, "world": world}
+    layers = layers_on(begun, validate(FileFlags, given, PYTHON), whole_config=whole)
     config = layers.config(settings)
     set_up_jax(config.env)
     console = stdout(quiet=quiet or not hosts.is_leader())
     return run_training(layers, config, console, callbacks, report)
-
-
-def _as_path(name: str, value: Any) -> Path | None:
-    """An argument as a path; None without one."""
-    if value is None or isinstance(value, str | Path):
-        return None if value is None else Path(value)
-    raise UserError(f"{name} is {shorten(str(value))}, but must be a path or a name")
 
 
 def run_training(
@@ -231,10 +216,8 @@ def run_training(
     """Trains with a config, which has its settings from layers, and returns the run.
 
     Raises:
-      UserError: the training would choose its checkpoint by the episodes of `bounce-mjx eval`, or
-        as `job.train`.
+      UserError: as `job.train`.
     """
-    config.check_eval_seed()
     resume = layers.start.run
     if resume is None:
         say(console, f"config: {layers.title}")

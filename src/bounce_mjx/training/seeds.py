@@ -25,7 +25,7 @@ class Best:
 
 @dataclasses.dataclass
 class SeedRun:
-    """One seed of a training run."""
+    """One seed of a training run; its number is `config.seed`."""
 
     run: Path
     """Folder of the seed's best checkpoint and log; with one seed, the run's folder itself."""

@@ -30,9 +30,8 @@ class Trainer(Protocol):
     the config's `ppo` describes.
 
     The job asks the algorithm for one (`Algorithm.make_trainer`), which may raise a UserError where
-    the config does not fit. Then it calls
-    `compile`, `start` once, and `run` for each block. It may ask for `state_template` at any time,
-    and after `start` for a `snapshot`.
+    the config does not fit. Then it calls `compile`, `start` once, and `train_block` for each
+    block. It may ask for `state_template` at any time, and after `start` for a `snapshot`.
     """
 
     checked: Sequence[str]
@@ -53,10 +52,10 @@ class Trainer(Protocol):
 
         Args:
           networks: those of an earlier training, which each seed starts with, and the statistics of
-            their inputs (`checkpoints.read_start`); not with a state.
+            their inputs (`checkpoints.read_warm_start`); not with a state.
         """
 
-    def run(self) -> BlockMetrics:
+    def train_block(self) -> BlockMetrics:
         """Trains for a block of I iterations (`TrainConfig.iterations_per_block`), each of
         `ppo.batch_steps` environment steps.
 

@@ -19,7 +19,7 @@ class ViewerOptions(StrictModel):
     viewer: Literal["auto", "browser", "native"] = "auto"
     """browser serves a page, native opens MuJoCo's own window, auto is native on a machine with a
     display and browser elsewhere."""
-    video: Annotated[Path | None, Flag(instead_of="--out")] = None
+    video: Annotated[Path | None, Flag(instead_of=("--out",))] = None
     """File for a video, .mp4, .webp or .gif, instead of a viewer."""
     html: Path | None = None
     """File for a page that replays the episode offline, instead of a viewer."""

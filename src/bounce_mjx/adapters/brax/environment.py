@@ -73,7 +73,7 @@ class BraxTaskEnv(brax.envs.Env):
         Raises:
           UserError: it has a warm-up.
         """
-        refuse_warmup(env.config, ENV_NAME)
+        refuse_warmup(env.config.randomization, ENV_NAME)
         self.core = env
         self.dt = self.core.dt
         """Time of one control step, s."""

@@ -1,7 +1,6 @@
 """B episodes on JAX, with NumPy arrays."""
 
 import functools
-import operator
 import os
 from typing import Any, NamedTuple
 
@@ -11,6 +10,7 @@ import numpy as np
 from gymnasium.spaces import Box
 
 from bounce_mjx.adapters.gymnasium.programs import Episodes, Programs, shared_programs
+from bounce_mjx.config.validation import checked_count
 from bounce_mjx.deploy.environments import refuse_warmup
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UnexpectedArgument, UserError
@@ -58,13 +58,13 @@ class Batch:
         """
         self.core = env
         self.config = env.config
-        refuse_warmup(self.config, "the environment's settings")
-        self.num_envs = whole_number("num_envs", num_envs)
+        refuse_warmup(self.config.randomization, "the environment's settings")
+        self.num_envs = checked_count("num_envs", num_envs)
         self.episode_steps = self.config.episode_steps
         """Time limit of an episode in steps."""
         if max_episode_steps not in (None, -1):
             longest = self.episode_steps
-            self.episode_steps = whole_number("max_episode_steps", max_episode_steps)
+            self.episode_steps = checked_count("max_episode_steps", max_episode_steps)
             if self.episode_steps > longest:
                 raise UserError(
                     f"max_episode_steps is {max_episode_steps}, but must be from 1 to the "
@@ -190,21 +190,6 @@ def checked_actions(actions: Any, shape: tuple[int, ...]) -> np.ndarray:
     if array.shape != shape:
         raise UserError(f"the action has the shape {array.shape}, but must have {shape}")
     return array
-
-
-def whole_number(name: str, value: Any) -> int:
-    """A whole number of at least 1.
-
-    Raises:
-      UserError: it is none.
-    """
-    try:
-        number = operator.index(value)
-    except TypeError:
-        number = 0
-    if number < 1:
-        raise UserError(f"{name} is {value!r}, but must be a whole number of at least 1")
-    return number
 
 
 def _with_batch_first(observation: np.ndarray) -> np.ndarray:

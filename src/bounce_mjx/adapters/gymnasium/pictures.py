@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from bounce_mjx.adapters.gymnasium.batch import Batch, whole_number
+from bounce_mjx.adapters.gymnasium.batch import Batch
+from bounce_mjx.config.validation import checked_count
 from bounce_mjx.errors import UserError
 from bounce_mjx.viewers.offscreen import Renderer
 
@@ -31,8 +32,8 @@ class Pictures:
             raise UserError(f'render_mode is {render_mode!r}; choose "rgb_array" or omit it')
         self._batch = batch
         self._is_on = render_mode is not None
-        self._width = whole_number("width", width)
-        self._height = whole_number("height", height)
+        self._width = checked_count("width", width)
+        self._height = checked_count("height", height)
         self._camera = camera
         if self._is_on:
             _ = self._renderer  # which a missing camera makes fail

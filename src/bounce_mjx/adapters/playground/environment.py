@@ -99,7 +99,7 @@ class PlaygroundTaskEnv(MjxEnv):
         Raises:
           UserError: it has a warm-up.
         """
-        refuse_warmup(env.config, ENV_NAME)
+        refuse_warmup(env.config.randomization, ENV_NAME)
         super().__init__(config_of(env.config) if config is None else config)
         self.core = env
 

@@ -5,7 +5,6 @@ for the device, because DLPack makes each library's stream wait for the other's.
 donated to the next step, so a step returns no view of it.
 """
 
-import numbers
 from typing import NamedTuple
 
 import jax
@@ -13,6 +12,7 @@ import jax.numpy as jnp
 import torch
 
 from bounce_mjx.adapters.torch.packing import Layout
+from bounce_mjx.config.validation import checked_count
 from bounce_mjx.env import vector
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
@@ -69,10 +69,8 @@ class TorchVectorEnv:
         Raises:
           UserError: torch cannot use JAX's device, or a metric or num_envs is wrong.
         """
-        if not isinstance(num_envs, numbers.Integral) or num_envs < 1:
-            raise UserError(f"num_envs is {num_envs!r}, but must be a whole number of at least 1")
         self.core = env
-        self.num_envs = num_envs
+        self.num_envs = checked_count("num_envs", num_envs)
         self.num_observations = self.core.observation_size
         self.num_actions = self.core.action_size
         self.device = _shared_device()
