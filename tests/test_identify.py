@@ -839,9 +839,11 @@ def test_the_servos_of_an_arm_are_of_one_make() -> None:
     shown = np.arange(6) < 5
     weights = problem.weights(pictures=0.0, angles=shown)
     fit = minimise(problem, Fit(layout.mean, w.starts), ["arm"], weights, 4)
-    found = layout.world(fit.vector)["servo_gain"]
-    np.testing.assert_allclose(found[shown], 0.3, rtol=0.05)
-    assert 0.25 < found[5] < 0.4
+    world = layout.world(fit.vector)
+    np.testing.assert_allclose(world["servo_gain"][shown], 0.3, rtol=0.05)
+    assert 0.25 < world["servo_gain"][5] < 0.4
+    # So are the dampings, which it does not show either: no servo is slower for it.
+    np.testing.assert_allclose(world["servo_damping"] / world["servo_gain"], 1.0, atol=0.3)
     # That each joint has a gain of its own is still open.
     deviation = certainty(problem, fit, layout.free(["arm"])).deviation[gains]
     assert np.all(deviation[shown] < 0.5 * layout.deviation[gains][shown])

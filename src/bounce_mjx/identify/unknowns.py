@@ -33,8 +33,9 @@ class Unknown(NamedTuple):
     """Whether it multiplies the model's number. The vector then has its logarithm, of which the
     deviation and the steps are: 10 is as far from 1 as a tenth."""
     common: float = 0.0
-    """Standard deviation of what the entries of all joints share, besides the deviation of each:
-    the servos of an arm are of one make."""
+    """Standard deviation of the one factor that all gains and dampings share, besides the deviation
+    of each: the torques of an arm's servos are of one make. It leaves the delay of a servo, damping
+    / gain, as it is: a slow servo and a long lag look alike."""
 
 
 _JOINTS = None
@@ -131,10 +132,8 @@ class Layout:
         """Prior means [P]."""
         self.deviation = column("deviation")
         """Prior standard deviations [P], beside what the joints share."""
-        covariance = np.eye(len(self.mean))
-        for name, place in self.slices.items():
-            covariance[place, place] += (self.unknowns[name].common / self.deviation[place]) ** 2
-        self.precision = np.linalg.inv(covariance)
+        common = column("common") / self.deviation
+        self.precision = np.linalg.inv(np.eye(len(common)) + np.outer(common, common))
         """Inverse of the prior's covariance [P, P], in units of the deviations."""
         self.limits = self.encode(column("limits").T)
         """Lower and upper limits [2, P]."""
