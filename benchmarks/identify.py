@@ -191,8 +191,9 @@ class _Robot:
             target = _RESOLUTION * np.round(target / _RESOLUTION)
         self.filtered = self.filtered + share * (target - self.filtered)
         if self.flaw == "backlash":
-            torque = d.actuator_force[list(self.addresses.actuators)]
-            self.play = 0.5 * _BACKLASH * np.tanh(torque)
+            # The motor, with the encoder, goes to its target freely as far as the play lets it.
+            free = self.filtered - self.bias - d.qpos[self.qpos]
+            self.play = np.clip(free, -0.5 * _BACKLASH, 0.5 * _BACKLASH)
         d.ctrl[list(self.addresses.actuators)] = self.filtered - self.bias - self.play
         if self.flaw == "asymmetric friction":
             friction = world["joint_frictionloss"] * _ASYMMETRY

@@ -433,10 +433,12 @@ def at_home(shift: tuple[float, float, float]) -> Log:
     return log._replace(joint_angles=angles, servo_targets=angles, ball_positions=balls)
 
 
-@pytest.mark.parametrize("shift", [(0.02, 0.0, 0.3), (0.4, -0.6, -0.02)])
+@pytest.mark.parametrize("shift", [(0.02, 0.0, 0.3), (0.4, -0.6, -0.02), (0.0, 0.0, -0.07)])
 def test_a_ball_beside_the_paddle_is_refused(shift) -> None:
+    """And none whose height a camera, a paddle and encoders of the prior explain."""
     config = read_preset(Path("default")).env
-    check_frame(windows_of(at_home((0.02, -0.02, 0.0))), config, "here")
+    for height in (-0.035, 0.0, 0.035):
+        check_frame(windows_of(at_home((0.02, -0.02, height))), config, "here")
     with pytest.raises(UserError, match="in the frame of the robot's base") as refused:
         check_frame(windows_of(at_home(shift)), config, "here")
     found = re.search(r"bounces (.+) m \(x, y, z\)", str(refused.value))[1]
@@ -823,6 +825,42 @@ def test_what_no_search_varied_has_the_deviation_of_its_prior() -> None:
     assert np.median(deviations[0][gains] / layout.deviation[gains]) < 0.9
     np.testing.assert_allclose(deviations[1][gains], layout.deviation[gains])
     np.testing.assert_allclose(deviations[1][chosen], deviations[0][chosen])
+
+
+def test_the_servos_of_an_arm_are_of_one_make() -> None:
+    """Five joints whose gains are 0.3 of the model's say of the sixth, which a log does not show,
+    that it is as soft; its prior alone would have it at the model's."""
+    problem = linear_problem(flight_log(20.0), np.random.default_rng(3))
+    layout, w = problem.layout, problem.windows
+    gains = layout.slices["servo_gain"]
+    soft = layout.vector({"servo_gain": np.full(6, 0.3)})
+    clean = w.split(problem.predict(soft, w.starts))[0]
+    problem = problem._replace(windows=w._replace(angles=clean))
+    shown = np.arange(6) < 5
+    weights = problem.weights(pictures=0.0, angles=shown)
+    fit = minimise(problem, Fit(layout.mean, w.starts), ["arm"], weights, 4)
+    world = layout.world(fit.vector)
+    np.testing.assert_allclose(world["servo_gain"][shown], 0.3, rtol=0.05)
+    assert 0.25 < world["servo_gain"][5] < 0.4
+    # So are the dampings, which it does not show either: no servo is slower for it.
+    np.testing.assert_allclose(world["servo_damping"] / world["servo_gain"], 1.0, atol=0.3)
+    # That each joint has a gain of its own is still open.
+    deviation = certainty(problem, fit, layout.free(["arm"])).deviation[gains]
+    assert np.all(deviation[shown] < 0.5 * layout.deviation[gains][shown])
+    assert deviation[5] == pytest.approx(layout.deviation[gains][5], rel=0.15)
+
+
+def test_an_offset_is_known_no_better_than_friction_lets_a_servo_rest() -> None:
+    """Friction that differs between directions moves an offset in all windows alike."""
+    problem = linear_problem(flight_log(20.0), np.random.default_rng(3))
+    layout, weights = problem.layout, problem.weights(pictures=0.0)
+    fit = minimise(problem, Fit(layout.mean, problem.windows.starts), ["arm"], weights, 2)
+    searched = layout.free(["arm"])
+    offsets = layout.slices["servo_offset"]
+    band = np.array([0.0, 1e-4, 1e-3, 3e-3, 1e-2, 2e-2])
+    free = certainty(problem, fit, searched).deviation[offsets]
+    held = certainty(problem, fit, searched, dead_band=band).deviation[offsets]
+    np.testing.assert_allclose(held, np.hypot(free, band / np.sqrt(3.0)), rtol=0.15)
 
 
 def test_a_log_that_no_world_explains_is_not_called_the_same_robot(

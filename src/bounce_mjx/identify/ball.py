@@ -23,6 +23,7 @@ from bounce_mjx.identify.fit import (
 from bounce_mjx.identify.flight import Flight, acceleration, fit_flight
 from bounce_mjx.identify.following import error_size
 from bounce_mjx.identify.simulation import Simulate, Simulated
+from bounce_mjx.identify.unknowns import ARM, BALL
 from bounce_mjx.identify.windows import BEFORE_BOUNCE, GUESSED_DRAG, Windows, is_seen
 from bounce_mjx.physics import edited_model
 from bounce_mjx.robot.model import find_addresses
@@ -35,13 +36,14 @@ _LATENCIES = np.arange(-0.004, 0.05, 0.008)
 _FRICTIONS = (0.01, 0.2)
 # Decrease of the cost from which the ball counts as one that leaves the paddle at once.
 _SHORT_CONTACT = 10.0
-# Distance of the bounces from the paddle's height beyond which the search would not find them, m.
-_BESIDE = 0.03
+# Prior deviations of the bounces' height beyond which it is another frame.
+_ANOTHER_FRAME = 3.0
 
 
 def check_frame(windows: Windows, config: WorldConfig, source: str) -> None:
-    """Refuses a ball that bounces beside the paddle: no search would find where it is, as it would
-    not bounce there.
+    """Refuses a ball that bounces where no world of the prior has it: farther from the paddle's
+    height than three deviations of what the camera's offset, the paddle's, and the encoders' zeros
+    make together, or beside its face.
 
     Raises:
       UserError: it does.
@@ -49,18 +51,35 @@ def check_frame(windows: Windows, config: WorldConfig, source: str) -> None:
     model = world_model(config, visual=False)
     half_size = model.geom_size[find_addresses(model).paddle_geom]
     tops = touching(model, windows)
+    farthest = _ANOTHER_FRAME * _height_deviation(model, windows, tops)
     offsets = []
     for s, top in tops.items():
         since = np.abs(windows.picture_times[s] - windows.bounces[s])
         offsets.append(windows.balls[s, np.argmin(since)] - top)
     offset = np.median(offsets, axis=0) if offsets else np.zeros(3)
-    if np.hypot(*offset[:2]) > np.max(half_size[:2]) or abs(offset[2]) > _BESIDE:
+    if np.hypot(*offset[:2]) > np.max(half_size[:2]) or abs(offset[2]) > farthest:
         x, y, z = offset
         raise UserError(
             f"the ball in {source} bounces {x:.3f}, {y:.3f}, {z:.3f} m (x, y, z) beside the "
             "paddle; give its position in the frame of the robot's base, in metres, z up, and the "
             "robot with the paddle as it is mounted"
         )
+
+
+def _height_deviation(
+    model: mujoco.MjModel, windows: Windows, tops: dict[int, np.ndarray]
+) -> float:
+    """Prior standard deviation of the bounces' height beside the model's paddle, m.
+
+    Args:
+      tops: of the model, as `touching` returns them.
+    """
+    variance = BALL["ball_position_bias"].deviation ** 2 + BALL["paddle_offset"].deviation ** 2
+    for zero in ARM["encoder_bias"].deviation * np.eye(windows.angles.shape[2]):
+        moved = touching(model, windows, zero)
+        shifts = [moved[s][2] - top[2] for s, top in tops.items()]
+        variance += np.mean(np.square(shifts)) if shifts else 0.0
+    return float(np.sqrt(variance))
 
 
 def touching(

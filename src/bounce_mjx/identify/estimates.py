@@ -53,7 +53,8 @@ def estimates(found: Identified, joint_names: Sequence[str]) -> list[Estimate]:
     values = terms(vector)
     samples = layout.clip(vector + found.certainty.changes)
     low, high = _intervals(terms(samples), values)
-    precision = found.certainty.information + np.diag(layout.deviation**-2.0)
+    prior = layout.precision / np.outer(layout.deviation, layout.deviation)
+    precision = found.certainty.information + prior
     # As much wider than for independent residuals as the interval itself.
     wider = found.deviation / np.sqrt(np.diag(np.linalg.inv(precision)))
     given_others = np.maximum(wider, 1.0) / np.sqrt(np.diag(precision))

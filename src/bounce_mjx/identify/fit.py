@@ -356,7 +356,8 @@ def _window_costs(problem: Problem, white: np.ndarray, states: np.ndarray) -> np
 
 
 def _prior_cost(layout: Layout, vector: np.ndarray) -> float:
-    return 0.5 * float(np.sum(((vector - layout.mean) / layout.deviation) ** 2))
+    from_mean = (vector - layout.mean) / layout.deviation
+    return 0.5 * float(from_mean @ layout.precision @ from_mean)
 
 
 def _first_of(
@@ -433,9 +434,10 @@ def _list_trials(
         line.by_state * reach,
         (fit.starts - guess)[:, entries] / reach,
     )
-    hessian = np.sum(reduced.informations, axis=0) + np.eye(len(unknowns))
-    from_mean = (fit.vector[unknowns] - layout.mean[unknowns]) / scale
-    slope = np.sum(reduced.gradients, axis=0) + from_mean
+    hessian = np.sum(reduced.informations, axis=0)
+    hessian += layout.precision[np.ix_(unknowns, unknowns)]
+    from_mean = (fit.vector - layout.mean) / layout.deviation
+    slope = np.sum(reduced.gradients, axis=0) + layout.precision[unknowns] @ from_mean
     room = (layout.bounds(fit.vector) - fit.vector)[:, unknowns] / scale
     vectors = []
     states = []

@@ -188,7 +188,10 @@ def identify(
             is_chosen[layout.terms[name]] = True
     counts = np.any(windows.split(fit.weights)[1] > 0.0, axis=(1, 2))
     by_sensor = problem._replace(noise=sensors, correlation=1.0)
-    known = certainty(problem, fit, is_estimated, is_chosen)
+    world = layout.world(fit.vector)
+    stiffness = servos_of(model).stiffness * world["servo_gain"]
+    dead_band = world["joint_frictionloss"] / stiffness if is_shown else 0.0
+    known = certainty(problem, fit, is_estimated, is_chosen, dead_band)
     if finer is not None:
         # Latency and lag are the same; their delay and its variance depend on the lag's steps.
         fit = fit._replace(vector=finer.layout.vector(layout.world(fit.vector)))

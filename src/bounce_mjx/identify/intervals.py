@@ -33,7 +33,11 @@ class Certainty(NamedTuple):
 
 
 def certainty(
-    problem: Problem, fit: Fit, is_estimated: np.ndarray, is_chosen: np.ndarray | None = None
+    problem: Problem,
+    fit: Fit,
+    is_estimated: np.ndarray,
+    is_chosen: np.ndarray | None = None,
+    dead_band: np.ndarray | float = 0.0,
 ) -> Certainty:
     """The estimates that other logs of the robot would give, by a bootstrap (Efron 1979) over
     blocks of windows, in the linearised problem.
@@ -41,10 +45,14 @@ def certainty(
     In units of the prior's deviations, window s has the derivatives J_s [M, P] and the gradient
     g_s = J_s' r_s, after its start is eliminated (`eliminate`). With the weights w_s of a resample
     (of a Bayesian bootstrap, Rubin 1981: of exponential distribution, alike in a block), the
-    estimate moves by -(sum_s w_s A_s + I)^-1 (sum_s w_s g_s + x - m - e), where A_s is the window's
-    information, x - m the distance from the prior's mean, and e a draw of the prior: what no window
-    shows has the prior's spread. What the model lacks is in the residuals r_s, and so in the
-    spread.
+    estimate moves by -(sum_s w_s A_s + Q)^-1 (sum_s w_s g_s + Q (x - m - e)), where A_s is the
+    window's information, Q the prior's (`Layout.precision`), x - m the distance from the prior's
+    mean, and e a draw of the prior: what no window shows has the prior's spread. What the model
+    lacks is in the residuals r_s, and so in the spread.
+
+    *What friction hides.* A servo rests anywhere within its dead band, friction / stiffness, and
+    what differs between a joint's directions, or its motions, moves it there in all windows alike:
+    its offset is known no better.
 
     *Information.* A bounce depends on where in a physics step it begins, which makes derivatives
     noisy, and J_s' J_s would count their noise as information. J1 and J2, by central differences
@@ -54,13 +62,14 @@ def certainty(
     J1.
 
     *Few windows.* A fit adapts to each block: its residuals have the covariance I - H_s in place
-    of I, where H_s = R' A_s R with (A + I)^-1 = R R' is the block's leverage. Its gradient is
+    of I, where H_s = R' A_s R with (A + Q)^-1 = R R' is the block's leverage. Its gradient is
     (I - H_s)^-1 g_s, that of a fit without it (the jackknife, CR3 of Bell and McCaffrey 2002).
 
     Args:
       is_estimated: which unknowns [P] are at the minimum; no search has moved the others from their
         prior mean, or from the number that was chosen for them.
       is_chosen: those of the latter [P], which the log says nothing about; by default none.
+      dead_band: distance [n] from its command at which the friction of each joint holds it, rad.
     """
     layout = problem.layout
     deviations, _, searched = problem.scale_starts()
@@ -94,7 +103,11 @@ def certainty(
         informations[:, is_chosen] = 0.0
         informations[:, :, is_chosen] = 0.0
         gradients[:, is_chosen] = 0.0
-    changes = resample(informations, gradients, is_estimated, np.random.default_rng(0)) * scale
+    random = np.random.default_rng(0)
+    prior = layout.precision
+    changes = resample(informations, gradients, is_estimated, random, prior) * scale
+    offsets = changes[:, layout.slices["servo_offset"]]
+    offsets += random.uniform(-1.0, 1.0, offsets.shape) * dead_band
     information = _positive(np.sum(informations, axis=0))
     return Certainty(information / np.outer(scale, scale), changes)
 
@@ -111,6 +124,7 @@ def resample(
     gradients: np.ndarray,
     is_estimated: np.ndarray,
     random: np.random.Generator,
+    precision: np.ndarray | None = None,
 ) -> np.ndarray:
     """Changes [B, P] of the estimate, in units of the prior's deviations.
 
@@ -118,13 +132,16 @@ def resample(
       informations: A_s [S, P, P] of the windows.
       gradients: g_s [S, P].
       is_estimated: which unknowns [P] are at the minimum.
+      precision: Q [P, P] of the prior; by default that of independent unknowns.
     """
     size = gradients.shape[1]
+    precision = np.eye(size) if precision is None else precision
+    root_precision = np.linalg.cholesky(precision)
     firsts = np.arange(0, len(gradients), _BLOCK)
     informations = np.add.reduceat(informations, firsts, axis=0)
     gradients = np.add.reduceat(gradients, firsts, axis=0)
-    values, vectors = np.linalg.eigh(_positive(np.sum(informations, axis=0)))
-    root = vectors / np.sqrt(values + 1.0)
+    values, vectors = np.linalg.eigh(_positive(np.sum(informations, axis=0)) + precision)
+    root = vectors / np.sqrt(values)
     leverage, turn = np.linalg.eigh(root.T @ informations @ root)
     larger = 1.0 / (1.0 - np.clip(leverage, 0.0, _LARGEST_LEVERAGE))
     inner = np.einsum("sij,sj,skj,sk->si", turn, larger, turn, gradients @ root)
@@ -136,8 +153,8 @@ def resample(
     for b in range(_RESAMPLES):
         weights = random.exponential(size=len(firsts))
         information = _positive(np.einsum("s,sij->ij", weights, informations))
-        slope = weights @ wider - random.normal(size=size)
-        changes[b] = -np.linalg.solve(information + np.eye(size), slope)
+        slope = weights @ wider - root_precision @ random.normal(size=size)
+        changes[b] = -np.linalg.solve(information + precision, slope)
     # A log takes no knowledge away; and what no search has moved is as little known as before.
     spread = np.maximum(np.std(changes, axis=0), 1e-12)
     return changes * np.where(is_estimated, np.minimum(1.0, 1.0 / spread), 1.0 / spread)

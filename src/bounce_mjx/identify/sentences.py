@@ -177,7 +177,9 @@ def _describe_mistakes(found: Identified, joint_names: Sequence[str]) -> list[st
     listed = estimates(found, joint_names)
     expected = layout.world(layout.mean)
     typical = np.concatenate([np.ravel(expected[name]) for name in layout.terms])
-    off = np.abs(vector - layout.mean) / layout.deviation
+    # From what the prior expects beside the other unknowns: a gain, beside those of other joints.
+    from_mean = (vector - layout.mean) / layout.deviation
+    off = np.abs(layout.precision @ from_mean) / np.sqrt(np.diag(layout.precision))
     # Of a physical quantity that may be absent, such as drag, 0 is a value like any other.
     is_near = np.abs(layout.limits - vector) < _AT_LIMIT * layout.deviation
     at_limit = np.any(is_near & (layout.limits != 0.0), axis=0)

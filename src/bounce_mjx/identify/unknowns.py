@@ -32,6 +32,10 @@ class Unknown(NamedTuple):
     is_factor: bool = False
     """Whether it multiplies the model's number. The vector then has its logarithm, of which the
     deviation and the steps are: 10 is as far from 1 as a tenth."""
+    common: float = 0.0
+    """Standard deviation of the one factor that all gains and dampings share, besides the deviation
+    of each: the torques of an arm's servos are of one make. It leaves the delay of a servo, damping
+    / gain, as it is: a slow servo and a long lag look alike."""
 
 
 _JOINTS = None
@@ -41,10 +45,10 @@ ARM = {
     "delay": Unknown(0.035, 0.03, 5e-4, "s", "arm", limits=(0.0, 0.4), ball_step=3e-3),
     "delay_variance": Unknown(2e-4, 4e-4, 1e-5, "s", "arm", limits=(0.0, 0.04), ball_step=6e-5),
     "servo_gain": Unknown(
-        1.0, 0.2, 0.02, "", "arm", _JOINTS, (0.1, 100.0), 0.15, own=True, is_factor=True
+        1.0, 0.2, 0.02, "", "arm", _JOINTS, (0.1, 100.0), 0.15, own=True, is_factor=True, common=1.0
     ),
     "servo_damping": Unknown(
-        1.0, 0.3, 0.02, "", "arm", _JOINTS, (0.05, 20.0), 0.15, own=True, is_factor=True
+        1.0, 0.3, 0.02, "", "arm", _JOINTS, (0.05, 20.0), 0.15, own=True, is_factor=True, common=1.0
     ),
     "servo_offset": Unknown(0.0, 0.002, 1e-3, "rad", "arm", _JOINTS, ball_step=0.0, own=True),
     "joint_frictionloss": Unknown(
@@ -127,7 +131,10 @@ class Layout:
         self.mean = self.encode(column("mean"))
         """Prior means [P]."""
         self.deviation = column("deviation")
-        """Prior standard deviations [P]."""
+        """Prior standard deviations [P], beside what the joints share."""
+        common = column("common") / self.deviation
+        self.precision = np.linalg.inv(np.eye(len(common)) + np.outer(common, common))
+        """Inverse of the prior's covariance [P, P], in units of the deviations."""
         self.limits = self.encode(column("limits").T)
         """Lower and upper limits [2, P]."""
         self.units = column("unit").tolist()
