@@ -161,7 +161,15 @@ def example(name: str) -> dict:
 
 
 @pytest.fixture(scope="module")
-def ppo_example(tmp_path_factory):
+def quick_compilation():
+    """The trainings of a few steps take most of their time to compile."""
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
+
+
+@pytest.fixture(scope="module")
+def ppo_example(quick_compilation, tmp_path_factory):
     """The folder and the evaluations of `examples/brax_ppo.py`."""
     folder = tmp_path_factory.mktemp("brax")
     small = {
@@ -223,7 +231,7 @@ def test_brax_checkpoint_has_the_trained_policy(ppo_example):
 
 
 @pytest.mark.slow
-def test_brax_sac_trains_and_evaluates(env):
+def test_brax_sac_trains_and_evaluates(env, quick_compilation):
     (make_policy, trained, _), history = train(
         brax_sac,
         env,
@@ -244,7 +252,7 @@ def test_brax_sac_trains_and_evaluates(env):
 
 
 @pytest.mark.slow
-def test_brax_apg_learns():
+def test_brax_apg_learns(quick_compilation):
     """Gradients through the physics and the reward raise the return."""
     history = example("brax_apg.py")["main"](
         policy_updates=30, num_evals=2, num_envs=8, num_eval_envs=4, episode_length=20

@@ -193,11 +193,10 @@ def test_an_entry_of_the_coefficient_acts_alone(mj_model, float64):
         edited_model(mj_model, other)
 
 
-@pytest.mark.parametrize("frictionloss", [0.0, 10.0], ids=["sliding", "sliding and dry"])
 @pytest.mark.slow
-def test_frictional_worlds_stay_with_c_for_2000_steps(frictionloss, float64):
-    """In 64 random worlds with servos at their limits, with sliding friction of the ball, with and
-    without dry friction of the joints."""
+def test_frictional_worlds_stay_with_c_for_2000_steps(float64):
+    """In 64 random worlds with servos at their limits, with sliding friction of the ball and dry
+    friction of the joints."""
     count, rng = 64, np.random.default_rng(0)
     base = mujoco.MjModel.from_xml_string(XML)
     base.opt.timestep = DT
@@ -206,7 +205,7 @@ def test_frictional_worlds_stay_with_c_for_2000_steps(frictionloss, float64):
         gravity=parameters.gravity * [0.1, 0.1, 1.0],
         contact_friction=rng.uniform(0.0, 1.0, count),
         force_limit=rng.uniform(10.0, 100.0, (count, 6)),
-        frictionloss=rng.uniform(0.0, frictionloss, (count, 6)) if frictionloss else None,
+        frictionloss=rng.uniform(0.0, 10.0, (count, 6)),
     )
     halves = [bouncing_states(base, rng) for _ in range(count // BATCH)]
     start = PhysicsState(*map(np.concatenate, zip(*(h[:2] for h in halves), strict=True)))
@@ -219,7 +218,7 @@ def test_frictional_worlds_stay_with_c_for_2000_steps(frictionloss, float64):
 
     _, contacts, seen = free_run(base, models, parameters, start, rng, look)
     assert contacts >= 1000
-    assert 0.02 < seen["sticking"] < 0.98 if frictionloss else seen["sticking"] == 0.0
+    assert 0.02 < seen["sticking"] < 0.98
 
 
 # Bounces and rolling on a held paddle
