@@ -121,7 +121,15 @@ def explain_arm(
     carried = Simulated(gravity_compensation=1.0)
     problem = own._replace(simulate=make(carried), simulated=carried)
     problem, fit = _exact_follower(problem, servos, given, choice.chosen)
-    return problem, with_offsets(problem, fit), choice
+    fit = with_offsets(problem, fit)
+    # A training simulates the follower, and its formula does not.
+    simulated = _judge_fit(choice.chosen, problem, fit, unseen)
+    of_training = [simulated, *(choice.trial(hypothesis) for hypothesis in searches)]
+    chosen = choose(of_training, windows, unseen, own.sensors.angles).chosen
+    if chosen in searches:
+        own.progress(f"{chosen.name} simulate it more exactly")
+        return *searches[chosen], choice._replace(chosen=chosen)
+    return problem, fit, choice
 
 
 def _directly(windows: Windows, given: Given) -> list[Trial]:
