@@ -88,7 +88,7 @@ def programs(configs: list[TrainConfig]) -> list[Callable[[], object]]:
     for trainer in trainers:
         trainer.start()
         trainer.train_block()
-    return [trainer.run for trainer in trainers]
+    return [trainer.train_block for trainer in trainers]
 
 
 def seconds_of(block: Callable[[], object]) -> float:

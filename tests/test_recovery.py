@@ -314,14 +314,14 @@ def test_the_chunks_of_an_evaluation_are_its_episodes(straight: Path) -> None:
 
 def change_state(monkeypatch, iteration: int, change: Callable) -> None:
     """Changes the state of every training before the given iteration."""
-    run = PPOTrainer.run
+    train_block = PPOTrainer.train_block
 
-    def run_changed(trainer: PPOTrainer, *args):
+    def train_changed(trainer: PPOTrainer, *args):
         if trainer.state.iteration == iteration - 1:
             trainer.state = change(trainer.state)
-        return run(trainer, *args)
+        return train_block(trainer, *args)
 
-    monkeypatch.setattr(PPOTrainer, "run", run_changed)
+    monkeypatch.setattr(PPOTrainer, "train_block", train_changed)
 
 
 @pytest.mark.slow

@@ -5,7 +5,7 @@ Arrays are numbers in OCDBT and zarr, and the rest is JSON: nothing in a checkpo
 Every function that reads raises a `UserError` if the checkpoint is damaged or its config differs
 from the run's.
 
-Orbax writes each checkpoint, and `save_checkpoint` chooses which ones stay. A `CheckpointManager`
+Orbax writes each checkpoint; `training/saving.py` chooses which ones stay. A `CheckpointManager`
 would choose by a file of its own, would not open a folder in which one such file is damaged, and
 would take a checkpoint for written whose save failed.
 """

@@ -9,7 +9,8 @@ training begins with. Everything else is values. They are layers, and a later on
     4. a preset that the user names, in place of the machine's
     5. a warm start: the environment and the networks of a policy
     6. the user's files and further presets, each on those before it
-    7. --robot, or the robot of --world; its file may say something of the training, too
+    7. --robot, or the robot of --world; its file may say something of the training, too; a warm
+       start brings its own, beside which there is no --robot
     8. --world
     9. what the user says: flags of the command, or arguments of `train`
 

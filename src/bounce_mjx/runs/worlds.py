@@ -39,8 +39,8 @@ class Layer(NamedTuple):
     values: dict[str, Any]
     """Nested, with the keys of `TrainConfig`."""
     is_world: bool = False
-    """Whether it replaces all terms of the randomisation. A preset's curriculum of terms that this
-    world does not have is dropped (`without_idle_curriculum`)."""
+    """Whether its values are of all terms of the randomisation. A preset's curriculum of terms that
+    this world does not have is dropped (`without_idle_curriculum`)."""
     whole: tuple[str, ...] = ()
     """Dotted keys of what it brings whole: also of a mapping, such as `shares`, nothing remains of
     the layers below."""

@@ -24,7 +24,7 @@ def first_block_fault(metrics: BlockMetrics, config: TrainConfig) -> str | None:
     every seed.
 
     Args:
-      metrics: each [S, I], as from `Trainer.run`.
+      metrics: each [S, I], as from `Trainer.train_block`.
     """
     # The iterations of each seed up to its first fault, with it: what follows is not due to the
     # settings.

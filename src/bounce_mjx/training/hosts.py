@@ -114,8 +114,8 @@ def exchange(value: Any) -> list[Any]:
 
 @contextlib.contextmanager
 def leave_without_waiting() -> Iterator[None]:
-    """If one of several processes fails, ends it without JAX's wait for the others at exit, once
-    they have had `_GRACE_SECONDS` for their own sentences."""
+    """If one of several processes ends with a user's error, ends it without JAX's wait for the
+    others at exit, once they have had `_GRACE_SECONDS` for their own sentences."""
     try:
         yield
     except SystemExit as error:

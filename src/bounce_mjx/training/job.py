@@ -206,7 +206,7 @@ class Job:
     steps: int = 0
     """Environment steps of each seed so far."""
     needs_save: bool = False
-    """Whether no save of the current state has been started."""
+    """Whether there is something new since the last save was started."""
     callback_has_ended: bool = False
     """Whether a callback has ended the training."""
     failure: BaseException | None = None

@@ -89,7 +89,7 @@ class NamedWorld(StrictModel):
         these settings refuses a number beyond the bounds of a setting that is no term.
 
         Args:
-          nominals: the values of all terms without randomisation (`env.env.model_nominals`).
+          nominals: the values of all terms without randomisation (`world.model.model_nominals`).
         """
         numbers = flat(self.settings)
         doubled = {}

@@ -97,7 +97,7 @@ class BraxTaskEnv(brax.envs.Env):
     def reset(self, rng: jax.Array) -> State:
         """Starts an episode; consumes the key `rng`."""
         env = self.core
-        # Only an environment that was asked for it has one.
+        # Only where `sys` was read can brax have replaced it.
         if "sys" in vars(self):
             env = randomized_env(env, self._own_sys, self.sys)
         return self._to_brax(env.reset(rng))
