@@ -2,6 +2,7 @@
 
 import math
 import re
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -636,6 +637,21 @@ def test_a_stuck_arm_is_seen_within_half_a_second(name: str, joints: Any) -> Non
     assert arm.fault == "joint_astray" and "does not follow its commands" in arm.reason
 
 
+def started(name: str) -> tuple[Any, Callable, np.ndarray, np.ndarray, int]:
+    """A supervisor that has been started beside a ball 0.4 m above the paddle; what it measures,
+    as from `supervised`; the paddle's place [3], m; its last commands [J], rad; its steps."""
+    arm, home, seen = supervised(name)
+    paddle = paddle_position(load_policy(name).metadata, home)
+    step, angles = 0, home
+    while arm.state != "ready" and step < 500:
+        given = seen(angles, step)
+        given["ball_position"] = paddle + [0.0, 0.0, 0.4]
+        angles = arm.commands(given)[-1]
+        step += 1
+    arm.start()
+    return arm, seen, paddle, angles, step
+
+
 HELD = {
     "above": ("robust", [0.0, 0.0, 0.3], 0.3),
     "beside": ("ur5e", [0.0, 0.4, 0.1], 0.3),
@@ -651,17 +667,8 @@ def test_a_ball_that_a_hand_holds_stops_the_arm(
     name: str, place: list[float], within: float, rate: float
 ) -> None:
     """As it does not fall; a ball that may rest does. Seen 30 ms late, with 3 mm of noise."""
-    arm, home, seen = supervised(name)
-    paddle = paddle_position(load_policy(name).metadata, home)
+    arm, seen, paddle, angles, began = started(name)
     rng = np.random.default_rng(0)
-    step, angles = 0, home
-    while arm.state != "ready" and step < 500:
-        given = seen(angles, step)
-        given["ball_position"] = paddle + [0.0, 0.0, 0.4]
-        angles = arm.commands(given)[-1]
-        step += 1
-    arm.start()
-    began = step
     shown = None
     for step in range(began, began + 60):
         given = seen(angles, step)
@@ -750,17 +757,9 @@ def test_two_balls_in_turn_on_a_paddle_are_no_ball_at_rest() -> None:
 @pytest.mark.parametrize("rate", [100.0, 60.0, 30.0])
 def test_low_bounces_in_a_row_are_no_hand(rate: float) -> None:
     """Of 7 cm, in which the ball is always near the paddle: no line is as bent."""
-    arm, home, seen = supervised("robust")
-    paddle = paddle_position(load_policy("robust").metadata, home)
+    arm, seen, paddle, angles, began = started("robust")
     rng = np.random.default_rng(0)
-    step, angles = 0, home
-    while arm.state != "ready" and step < 500:
-        given = seen(angles, step)
-        given["ball_position"] = paddle + [0.0, 0.0, 0.4]
-        angles = arm.commands(given)[-1]
-        step += 1
-    arm.start()
-    began, flight = step, 0.24
+    flight = 0.24
     shown = None
     for step in range(began, began + 80):
         given = seen(angles, step)
