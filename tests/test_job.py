@@ -35,7 +35,7 @@ from bounce_mjx.runs.folders import (
     find_checkpoint,
     latest_checkpoint,
     lock_run,
-    run_or_newest,
+    place_or_newest,
     stored_checkpoints,
 )
 from bounce_mjx.runs.layers import read_layers
@@ -43,6 +43,7 @@ from bounce_mjx.runs.start import Choice
 from bounce_mjx.training import hosts, job, saving
 from bounce_mjx.training.events import Event
 from bounce_mjx.training.faults import first_block_fault
+from bounce_mjx.training.saving import Saver
 from bounce_mjx.training.trainer import Snapshot
 from tiny_runs import contents
 
@@ -492,6 +493,22 @@ def test_a_signal_saves_and_says_how_to_resume(tmp_path: Path, number: signal.Si
     assert evaluated_steps(run) == [64, 128, 192, 256]
 
 
+def test_a_signal_during_the_last_save_is_not_lost(tmp_path: Path, monkeypatch) -> None:
+    start = Saver.start
+
+    def interrupted(self, snapshot, steps, about):
+        # That of the final results has no state.
+        if snapshot is None:
+            os.kill(os.getpid(), signal.SIGTERM)
+        start(self, snapshot, steps, about)
+
+    monkeypatch.setattr(Saver, "start", interrupted)
+    with pytest.raises(job.TrainingStopped, match="after 128 steps, after the final evaluation"):
+        train(tmp_path, {1: 5.0, 2: 9.0})
+    (run,) = tmp_path.iterdir()
+    assert results_of(run)["fresh_resets"]
+
+
 def test_a_signal_during_the_compilation_leaves_nothing(tmp_path: Path) -> None:
     ended = concurrent.futures.Future()
 
@@ -854,7 +871,7 @@ def test_each_seed_has_a_run_of_its_own_and_the_best_one_is_found(tmp_path: Path
         assert evaluated_steps(folder) == [64, 128, 192]
         assert results_of(folder)["best_steps"] == BLOCK * best
         assert iterations_of(best_checkpoint(folder)) == best
-    assert find_checkpoint(run_or_newest(None, tmp_path)) == best_checkpoint(folders[1])
+    assert find_checkpoint(place_or_newest(None, tmp_path)) == best_checkpoint(folders[1])
     # Resumed, each knows its best one.
     train(tmp_path, returns | {4: (2.5, 9.0, 1.0)}, run, num_seeds=SEEDS)
     assert [results_of(folder)["best_steps"] for folder in folders] == [128, 256, 192]
