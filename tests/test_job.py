@@ -311,10 +311,16 @@ def test_a_history_of_checkpoints_stays_where_it_is_asked_for(tmp_path: Path) ->
 
 
 def test_the_state_of_all_seeds_is_no_policy_and_no_damage(tmp_path: Path) -> None:
-    run = train(tmp_path, RETURNS, num_seeds=SEEDS)
-    state = find_checkpoint(run / "checkpoints")
+    """Of no command: a warm start, a plot and a report find it as an evaluation does."""
+    run = train(tmp_path / "evaluated", RETURNS, num_seeds=SEEDS)
     with pytest.raises(UserError, match="holds the state of all 3 seeds, with which .*; give"):
-        read_policy(state, load_run_config(run))
+        find_checkpoint(run / "checkpoints")
+    signalled = before(2, lambda: os.kill(os.getpid(), signal.SIGTERM))
+    with pytest.raises(job.TrainingStopped):
+        train(tmp_path, RETURNS, trainer=signalled, num_seeds=SEEDS, eval_every=4 * BLOCK)
+    (run,) = tmp_path.glob("2*")
+    with pytest.raises(UserError, match="no policy is evaluated yet; resume it: bounce-mjx train"):
+        find_checkpoint(run)
 
 
 @pytest.mark.parametrize(("given", "trained"), [(170, 192), (80, 64)])

@@ -76,12 +76,6 @@ def read_policy(checkpoint: Checkpoint, config: TrainConfig) -> Policy:
     """Restores the policy of a checkpoint."""
     # Refuses a damaged one.
     read_record(checkpoint)
-    seeds = folders.runs_of_seeds(checkpoint.run)
-    if seeds != [checkpoint.run] and not (checkpoint.folder / POLICY).is_dir():
-        raise UserError(
-            f"{checkpoint.folder} holds the state of all {len(seeds)} seeds, with which a training "
-            f"resumes; give {checkpoint.run} for its best policy, or a seed such as {seeds[0]}"
-        )
     policy = _read_arrays(checkpoint, POLICY, policy_shapes(config))
     for path, array in jax.tree_util.tree_leaves_with_path(policy):
         if not np.all(np.isfinite(array)):

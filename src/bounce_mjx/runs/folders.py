@@ -284,13 +284,23 @@ def find_checkpoint(path: str | Path) -> Checkpoint:
       path: a run's folder (finds its best checkpoint, or its latest if there is no best), a folder
         of checkpoints in it, or a checkpoint; or a name in `POLICIES`, unless there is a folder
         with that name.
+
+    Raises:
+      UserError: there is none, or it is none of a policy but that of a run's several seeds.
     """
     place = policy_path(path)
     run = run_of(place)
     if os.path.samefile(place, run):
         run = _best_seed(run)
         place = run
-    return best_checkpoint(run, place)
+    seeds = runs_of_seeds(run)
+    if seeds == [run]:
+        return best_checkpoint(run, place)
+    advice = f"give {run} for its best policy, or a seed such as {seeds[0]}"
+    if place == run:
+        advice = f"no policy is evaluated yet; resume it: bounce-mjx train {run}"
+    state = f"holds the state of all {len(seeds)} seeds, with which a training resumes"
+    raise UserError(f"{place} {state}; {advice}")
 
 
 def latest_checkpoint(run: Path, place: Path | None = None) -> Checkpoint:

@@ -129,7 +129,8 @@ def read_config_file(
     values = read_mapping(path, kind, example)
     for key in {"task", "algorithm"} & values.keys():
         if not isinstance(values[key], str):
-            raise UserError(f"{shown_file(path)}: {key} is {values[key]}, but must be a name")
+            given = "null" if values[key] is None else values[key]
+            raise UserError(f"{shown_file(path)}: {key} is {given}, but must be a name")
     env = values.get("env")
     mjcf = env.get("mjcf") if isinstance(env, dict) else None
     if isinstance(mjcf, str) and not mjcf.startswith("~") and not is_packaged(Path(mjcf)):
