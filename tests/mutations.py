@@ -175,7 +175,7 @@ FAULTS = [
     ("a file wins over a flag", "runs/layers.py",
      "layers = [*self.below, *above]", "layers = [*above, *self.below]", "test_settings.py -k wins_over_those"),
     ("the machine's preset wins over an algorithm's defaults", "runs/layers.py",
-     "below=(*machines, *changed,", "below=(*changed, *machines,", "test_settings.py -k algorithms_own_default"),
+     "            *read.machine,\n            *changed,\n", "            *changed,\n            *read.machine,\n", "test_settings.py -k algorithms_own_default"),
     ("a world loses its own randomisation", "runs/worlds.py",
      'merged({"env": {"randomization": default}}, {"env": _settings_for(task, world)})', 'merged({"env": world.settings}, {"env": {"randomization": default}})', "test_settings.py -k wins_over_those"),
     ("another version's setting is taken for a slip", "runs/config.py", "if key is None:", "if True:", "test_runs.py -k another_version"),

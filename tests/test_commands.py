@@ -64,6 +64,10 @@ MISTAKES = (
     ("train --seed 3 catch", "catch is what the training begins with; give it first"),
     ("train cach", "no task, policy or run cach; did you mean catch?"),
     ("train robust_small --warm-start robust", "are two policies; leave one out"),
+    (
+        "train --keep-checkpoints 0",
+        "--keep-checkpoints is 0, but must be greater than or equal to 1, or be 'all'",
+    ),
     ("train --config a.yaml", "a.yaml", "No such file", "configs/default.yaml"),
     ("train --config nope", "no preset is named nope", "cpu, default, finetune"),
     ("train --robot nope", "no robot is named nope", "iiwa, panda, peitian, ur5e"),

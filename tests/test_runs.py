@@ -35,7 +35,7 @@ from bounce_mjx.runs.folders import (
     create_run,
     find_checkpoint,
     latest_checkpoint,
-    run_or_newest,
+    place_or_newest,
     save_config,
 )
 from bounce_mjx.runs.layers import read_preset
@@ -118,11 +118,12 @@ def test_the_arm_of_the_newest_run_is_named(runs: Path, capsys) -> None:
 
 def test_latest_is_a_name_for_every_command(runs: Path, monkeypatch) -> None:
     monkeypatch.chdir(runs)
-    assert run_or_newest(Path("latest"), runs) == run_or_newest(None, runs) == runs / "2026-01-02"
+    for word in (Path("latest"), None):
+        assert place_or_newest(word, runs) == runs / "2026-01-02"
     command = settings_of(["latest", "--log-dir", str(runs)])
-    assert command.layers.start.run == runs / "2026-01-02"
+    assert command.layers.start.place == runs / "2026-01-02"
     (runs / "latest").mkdir()
-    assert run_or_newest(Path("latest"), runs) == Path("latest")
+    assert place_or_newest(Path("latest"), runs) == Path("latest")
 
 
 def test_the_newest_run_is_not_the_greatest_name(tmp_path: Path) -> None:
@@ -133,8 +134,8 @@ def test_the_newest_run_is_not_the_greatest_name(tmp_path: Path) -> None:
         (tmp_path / name / "checkpoints/64").mkdir(parents=True)
         save_config(tmp_path / name, TrainConfig())
     while names:
-        assert run_or_newest(None, tmp_path).name == names.pop()
-        shutil.rmtree(run_or_newest(None, tmp_path))
+        assert place_or_newest(None, tmp_path).name == names.pop()
+        shutil.rmtree(place_or_newest(None, tmp_path))
 
 
 def test_a_run_is_opened_by_its_path_and_reads_its_policy_once(trained: Path, monkeypatch) -> None:
@@ -346,7 +347,7 @@ def test_files_of_the_user_lie_on_each_other(presets: Path) -> None:
         assert config.ppo.num_envs == read_preset(None).ppo.num_envs
         files = train_command.read_command(flags.split()).flags.config
         cpu, named, given = preset_files(files, config.task)
-        assert (cpu, named) == (resource_path("configs/cpu.yaml"), None)
+        assert (cpu, named) == ([resource_path("configs/cpu.yaml")], [])
         assert " ".join(map(str, given)) == flags.replace("--config=", "").replace("--config ", "")
     (presets / "more.yaml").write_text("base: randomized")
     with pytest.raises(UserError, match="more.yaml lies on my.yaml, so its base is not used"):

@@ -457,7 +457,7 @@ def test_what_a_file_cannot_say_is_told(folder: Path, refused) -> None:
     line = "train --config my.yaml --print-config"
     refused(line, "my.yaml: robot is no setting; leave it out, and give --robot or train(robot=")
     (folder / "my.yaml").write_text("task: null")
-    refused(line, "my.yaml: task is None, but must be a name")
+    refused(line, "my.yaml: task is null, but must be a name")
     (folder / "run").mkdir()
     refused("train run --log-dir typo", "--log-dir is where the newest run is looked for")
 

@@ -25,8 +25,10 @@ from bounce_mjx.runs.checkpoints import (
     read_warm_start,
     save_checkpoint,
 )
-from bounce_mjx.runs.config import load_run_config
+from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.folders import best_checkpoint, create_run, find_checkpoint
+from bounce_mjx.runs.layers import layers_on
+from bounce_mjx.runs.start import FileFlags, StartFlags, find_start
 from tiny_runs import STEPS, TINY, settings_of
 
 CRITIC = {"n_bounces", "world/restitution", "world/air_drag"}
@@ -158,7 +160,13 @@ def test_the_latest_run_is_that_beside_the_new_one_or_else_of_the_task(
     config = settings_of("--warm-start latest --log-dir new".split()).config
     assert config.warm_start == best_checkpoint(run).folder
     assert config.log_dir == Path("new")
-    # But where the new one's folder has runs, it is one of those, as with --resume.
+    # But where the new one's folder has runs, it is one of those, as for a run that is resumed.
     other = shutil.copytree(run, tmp_path / "mine/2025-01-01_00-00-00")
     config = settings_of("--warm-start latest --log-dir mine".split()).config
     assert config.warm_start == best_checkpoint(other).folder
+    # A whole config may name it too.
+    whole = TrainConfig(warm_start=Path("latest"), env=config.env, ppo=config.ppo)
+    start = find_start(None, StartFlags(log_dir=Path("mine")), whole)
+    config = layers_on(start, FileFlags()).config()
+    assert config.warm_start == best_checkpoint(other).folder
+    assert config.sources["warm_start"] == "config"

@@ -15,7 +15,7 @@ from pydantic.fields import FieldInfo
 from bounce_mjx.config.command_line import flag_names, parse, read_flags, stdout, typed
 from bounce_mjx.config.files import dump_with_sources, flat
 from bounce_mjx.config.settings import Count, NonNegativeInt, fields_in
-from bounce_mjx.errors import UserError, exit_on_user_error
+from bounce_mjx.errors import UserError
 from bounce_mjx.interrupt import in_daemon_thread, leave
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.layers import Layers, layers_on
@@ -203,9 +203,7 @@ def train(command: TrainCommand, settings: Settings) -> None:
     from bounce_mjx.training.job import TrainingStopped, imports_of
     from bounce_mjx.training.run import run_training
 
-    # A second `exit_on_user_error`, within: a mistake becomes a status here, on which this process
-    # leaves without waiting for the others.
-    with hosts.leave_without_waiting(), exit_on_user_error():
+    with hosts.leave_on_user_error():
         if flags.on_several_hosts:
             # JAX must not be asked for its devices before.
             numbers = flags.num_processes, flags.process_id, flags.host_timeout

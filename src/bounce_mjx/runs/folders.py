@@ -1,5 +1,6 @@
-"""Folders of runs and checkpoints, and functions that find them. Everywhere, `run` is the path of a
-run's folder, and of a seed's, which looks like one; `training.run.Run` reads it for a user.
+"""Folders of runs and checkpoints, and functions that find them. Everywhere, a `run` is the path of
+a run's folder, or of a seed's, which looks like one (`training.run.Run` reads it for a user); a
+`place` is that or a path in it, such as a checkpoint.
 
     runs/<task>/<time stamp, UTC>/      <task> as in `runs_folder`: that of bounce is bounce_ball
         config.yaml                     the resolved config
@@ -27,10 +28,10 @@ What finds them, and raises a `UserError` where there is nothing:
 
 | from | function | finds |
 |---|---|---|
-| a user's word, or none | `run_or_newest` | what the word names, or the newest run |
+| a user's word, or none | `place_or_newest` | the place that it names, or the newest run |
 | | `choose_checkpoint` | the checkpoint to show: of the word, the newest run or the package |
-| a path, or a policy's name | `run_of` | the run's folder |
-| | `find_checkpoint` | the best checkpoint there, with several seeds that of the best one |
+| a place | `run_of` | its run |
+| a place, or a policy's name | `find_checkpoint` | the best checkpoint there, of the best seed |
 | a run's or a seed's own folder | `best_checkpoint`, `latest_checkpoint` | one of its own |
 | | `stored_checkpoints`, `runs_of_seeds` | all of its checkpoints or seeds |
 | a folder of runs | `runs_in` | all runs that have a checkpoint |
@@ -218,18 +219,18 @@ def lock_run(run: Path) -> Iterator[None]:
         os.close(descriptor)
 
 
-def run_of(path: Path) -> Path:
-    """Folder of the run that contains a path; the path may be the folder itself."""
+def run_of(place: Path) -> Path:
+    """Folder of the run of a place."""
     # Unlike os.path.isdir, Path.is_dir raises an error for a name that is too long.
-    if not os.path.isdir(path):
-        near = suggest(str(path), [LATEST, *POLICIES])
+    if not os.path.isdir(place):
+        near = suggest(str(place), [LATEST, *POLICIES])
         advice = near or "give a run's folder such as runs/bounce_ball/<time stamp>"
-        raise UserError(f"there is no run and no policy {path}; {advice}")
-    for folder in (path, *Path(os.path.abspath(path)).parents):
+        raise UserError(f"there is no run and no policy {place}; {advice}")
+    for folder in (place, *Path(os.path.abspath(place)).parents):
         if (folder / CONFIG_FILE).is_file():
             return folder
     raise UserError(
-        f"{path} is not in a run's folder, as there is no {CONFIG_FILE}; give a folder that "
+        f"{place} is not in a run's folder, as there is no {CONFIG_FILE}; give a folder that "
         "bounce-mjx train made"
     )
 
@@ -253,9 +254,9 @@ def check_newest(paths: Sequence[Path | None]) -> None:
         )
 
 
-def run_or_newest(path: Path | None, log_dir: Path) -> Path:
-    """A run's folder or a path in it, as the user named it; where it names none (`is_newest`), the
-    newest run with a checkpoint in `log_dir`."""
+def place_or_newest(path: Path | None, log_dir: Path) -> Path:
+    """The place that the user names; where that is none (`is_newest`), the newest run with a
+    checkpoint in `log_dir`."""
     if not is_newest(path):
         return path
     if not (found := runs_in(log_dir)):
@@ -283,12 +284,23 @@ def find_checkpoint(path: str | Path) -> Checkpoint:
       path: a run's folder (finds its best checkpoint, or its latest if there is no best), a folder
         of checkpoints in it, or a checkpoint; or a name in `POLICIES`, unless there is a folder
         with that name.
+
+    Raises:
+      UserError: there is none, or it is none of a policy but that of a run's several seeds.
     """
-    path = policy_path(path)
-    run = run_of(path)
-    if os.path.samefile(path, run):
-        path = run = _best_seed(run)
-    return best_checkpoint(run, path)
+    place = policy_path(path)
+    run = run_of(place)
+    if os.path.samefile(place, run):
+        run = _best_seed(run)
+        place = run
+    seeds = runs_of_seeds(run)
+    if seeds == [run]:
+        return best_checkpoint(run, place)
+    advice = f"give {run} for its best policy, or a seed such as {seeds[0]}"
+    if place == run:
+        advice = f"no policy is evaluated yet; resume it: bounce-mjx train {run}"
+    state = f"holds the state of all {len(seeds)} seeds, with which a training resumes"
+    raise UserError(f"{place} {state}; {advice}")
 
 
 def latest_checkpoint(run: Path, place: Path | None = None) -> Checkpoint:
@@ -391,18 +403,18 @@ def choose_checkpoint(
     if policy_folder(path):
         return find_checkpoint(path)
     try:
-        run = run_or_newest(path, log_dir)
+        place = place_or_newest(path, log_dir)
     except UserError:
         policy = _policy_of_folder(log_dir)
         if path is not None or policy is None:
             raise
         tell(f"no run in {log_dir}: using the policy that comes with the package")
         return find_checkpoint(resource_path(POLICIES[policy]))
-    if run != path:
-        results = load_results(_best_seed(run))
+    if place != path:
+        results = load_results(_best_seed(place))
         known = results.best.summary if results else "not evaluated"
-        tell(f"using the newest run: {run}{_arm_of(run)} ({known})")
-    return find_checkpoint(run)
+        tell(f"using the newest run: {place}{_arm_of(place)} ({known})")
+    return find_checkpoint(place)
 
 
 def _arm_of(run: Path) -> str:

@@ -30,12 +30,12 @@ _EXAMPLE = "configs/default.yaml"
 class PresetFiles(NamedTuple):
     """The files of a config; each lies on those before it."""
 
-    machine: Path | None
-    """The preset for this machine, where the user names no other one."""
-    named: Path | None
-    """The preset that the user names."""
-    own: tuple[Path, ...]
-    """The user's files."""
+    machine: Sequence[Path]
+    """The preset for this machine, where the user names no other one; else none."""
+    preset: Sequence[Path]
+    """The preset that the user names; or none."""
+    files: Sequence[Path]
+    """The user's files, and further presets."""
 
 
 def preset_files(config: Sequence[Path], task: str, machine: Path | None = None) -> PresetFiles:
@@ -67,26 +67,26 @@ def preset_files(config: Sequence[Path], task: str, machine: Path | None = None)
     if not files or files[0] not in bases:
         # The first file is silent: on the machine's.
         base = machine or default_preset(has_accelerator())
-        return PresetFiles(_preset(str(base), of_task), None, tuple(files))
+        return PresetFiles(_preset(str(base), of_task), [], files)
     base = bases[files[0]]
     if base is not None:
         # It names one.
-        named = _preset(str(base), of_task)
-        if named is None:
+        preset = _preset(str(base), of_task)
+        if not preset:
             raise UserError(
                 f"{files[0]}: {BASE} is {shorten(repr(base))}; give the name of a preset, or null"
             )
-        return PresetFiles(None, named, tuple(files))
+        return PresetFiles([], preset, files)
     # It stands alone: a preset of the package, or a file of the user's.
     if files[0].resolve().is_relative_to(resource_path(PRESETS).resolve()):
-        return PresetFiles(None, files[0], tuple(files[1:]))
-    return PresetFiles(None, None, tuple(files))
+        return PresetFiles([], files[:1], files[1:])
+    return PresetFiles([], [], files)
 
 
-def _preset(name: str, of_task: str) -> Path | None:
-    """The preset of a name, a task's own one first."""
+def _preset(name: str, of_task: str) -> list[Path]:
+    """The preset of a name, of two the task's own one; empty without one."""
     paths = [resource_path(f"{folder}/{name}.yaml") for folder in (of_task, PRESETS)]
-    return next((path for path in paths if os.path.isfile(path)), None)
+    return list(filter(os.path.isfile, paths))[:1]
 
 
 def named_file(path: Path, folder: str, kind: str | None = None) -> Path:
@@ -129,7 +129,8 @@ def read_config_file(
     values = read_mapping(path, kind, example)
     for key in {"task", "algorithm"} & values.keys():
         if not isinstance(values[key], str):
-            raise UserError(f"{shown_file(path)}: {key} is {values[key]}, but must be a name")
+            given = "null" if values[key] is None else values[key]
+            raise UserError(f"{shown_file(path)}: {key} is {given}, but must be a name")
     env = values.get("env")
     mjcf = env.get("mjcf") if isinstance(env, dict) else None
     if isinstance(mjcf, str) and not mjcf.startswith("~") and not is_packaged(Path(mjcf)):

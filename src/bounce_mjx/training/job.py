@@ -6,7 +6,8 @@ From a signal to its checkpoint: `StopRequest` notes the signal, the block goes 
 (`train_block`), an evaluation that is due is left out (on several hosts it is done, as a process
 that stopped alone would keep the others waiting), `is_stopping` ends the loop, and `finish` saves
 the state, waits until it is written, and raises `TrainingStopped` with the command that resumes
-the run. A second signal ends the process at once (`interrupt.py`); what was saved before it stays.
+the run, also where the signal came as late as the last save. A second signal ends the process at
+once (`interrupt.py`); what was saved before it stays.
 An exception in a callback takes the way of a first signal, and is raised at its end; the callback
 is called no more.
 """
@@ -455,27 +456,29 @@ class Job:
           UserError: the state could not be saved.
           BaseException: what a callback raised.
         """
-        stopping = self.is_stopping()
-        where = ""
-        if self.is_finished() and not stopping:
-            self.say(self.why_it_ends())
+        is_early = self.is_stopping()
         # The policy of a warm start is saved once it is evaluated.
         has_nothing = self.is_new and self.steps == 0 and not self.is_evaluated()
-        if stopping and has_nothing:
+        if is_early and has_nothing:
             jax.distributed.shutdown()
             raise self.failure or Interrupted
+        if not is_early:
+            self.say(self.why_it_ends())
         if self.needs_save:
             self.save()
         self.end_last_save("the end of the training is lost")
-        if not stopping and not self.evaluate_best():
-            stopping = True
-            where = ", before the final evaluation"
+        where = ""
+        if not is_early:
+            is_measured = self.evaluate_best()
+            where = f", {'after' if is_measured else 'before'} the final evaluation"
+        # A signal may have come during the last save, too.
+        is_stopping = self.is_stopping()
         # Every process waits here for the others, of which none needs it any more.
         jax.distributed.shutdown()
         if self.failure is not None:
             self.say(f"a callback failed after {self.steps:,} steps; {self.continuing}")
             raise self.failure
-        if stopping:
+        if is_stopping:
             raise TrainingStopped(
                 f"stopped after {self.steps:,} steps{where}; {self.continuing}{self.report_so_far}"
             )

@@ -199,7 +199,7 @@ def train(
     of_start["warm_start"] = warm_start
     begun = find_start(word, validate(StartFlags, of_start, PYTHON), whole)
     given = {"config": files, "robot": robot, "world": world}
-    layers = layers_on(begun, validate(FileFlags, given, PYTHON), whole_config=whole)
+    layers = layers_on(begun, validate(FileFlags, given, PYTHON))
     config = layers.config(settings)
     set_up_jax(config.env)
     console = stdout(quiet=quiet or not hosts.is_leader())
@@ -218,7 +218,7 @@ def run_training(
     Raises:
       UserError: as `job.train`.
     """
-    resume = layers.start.run
+    resume = layers.start.place
     if resume is None:
         say(console, f"config: {layers.title}")
     notes = notes_on_learning_rate(config) + notes_on_worlds(config) + notes_on_intervals(config)
