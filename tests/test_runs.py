@@ -347,8 +347,10 @@ def test_files_of_the_user_lie_on_each_other(presets: Path) -> None:
         assert config.ppo.num_envs == read_preset(None).ppo.num_envs
         files = train_command.read_command(flags.split()).flags.config
         cpu, named, given = preset_files(files, config.task)
-        assert (cpu, named) == ([resource_path("configs/cpu.yaml")], [])
-        assert " ".join(map(str, given)) == flags.replace("--config=", "").replace("--config ", "")
+        assert [file.path for file in cpu] == [resource_path("configs/cpu.yaml")] and not named
+        assert " ".join(str(file.path) for file in given) == flags.replace("--config=", "").replace(
+            "--config ", ""
+        )
     (presets / "more.yaml").write_text("base: randomized")
     with pytest.raises(UserError, match="more.yaml lies on my.yaml, so its base is not used"):
         read_preset([Path("my.yaml"), Path("more.yaml")])

@@ -206,10 +206,15 @@ def train(command: TrainCommand, settings: Settings) -> None:
     with hosts.leave_on_user_error():
         if flags.on_several_hosts:
             # JAX must not be asked for its devices before.
-            numbers = flags.num_processes, flags.process_id, flags.host_timeout
-            hosts.join(flags.coordinator_address, *numbers)
+            hosts.join(
+                flags.coordinator_address,
+                flags.num_processes,
+                flags.process_id,
+                limit=flags.host_timeout,
+            )
         layers, config = _for_devices(command, settings)
-        console, callbacks = stdout(quiet=not hosts.is_leader()), []
+        console = stdout(quiet=not hosts.is_leader())
+        callbacks = []
         is_watched = flags.watch and hosts.is_leader()
         if is_watched:
             # Only a training run that is watched pays for this import.

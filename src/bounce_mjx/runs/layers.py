@@ -28,7 +28,14 @@ from bounce_mjx.config.validation import describe, groups_of, path_of
 from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.learning.config import NETWORK_KEYS, PPOConfig
 from bounce_mjx.runs.config import DEFAULT_SOURCE, RESUMABLE_KEYS, TrainConfig
-from bounce_mjx.runs.presets import BASE, SOURCES, preset_files, read_config_file, shown_file
+from bounce_mjx.runs.presets import (
+    BASE,
+    SOURCES,
+    ConfigFile,
+    preset_files,
+    read_config_file,
+    shown_file,
+)
 from bounce_mjx.runs.start import Choice, FileFlags, Start, check_not_given, find_start
 from bounce_mjx.runs.worlds import Layer, layers_of_environment
 from bounce_mjx.world.named import without_idle_curriculum
@@ -159,14 +166,12 @@ def _check_start(layer: Layer, start: Start) -> None:
             )
 
 
-def _layers_of_files(files: Iterable[Path]) -> list[Layer]:
-    """A layer of each file."""
+def _layers_of_files(files: Iterable[ConfigFile]) -> list[Layer]:
+    """A layer of each file, with its settings alone."""
     layers = []
-    for file in files:
-        values = read_config_file(file)
-        values.pop(BASE, None)
-        values.pop(SOURCES, None)
-        layers.append(Layer(shown_file(file), values))
+    for path, values in files:
+        settings = {key: value for key, value in values.items() if key not in (BASE, SOURCES)}
+        layers.append(Layer(shown_file(path), settings))
     return layers
 
 
@@ -342,6 +347,11 @@ class Layers:
         return []
 
     def _validated(self, values: dict[str, Any]) -> TrainConfig:
+        """The typed config of nested values.
+
+        Raises:
+          _Mistake: a key is unknown, or a value is out of range.
+        """
         groups = {"env": self.start.task.Config, "ppo": self.start.algorithm_config}
         typed = dict(values)
         for name, kind in groups.items():
@@ -421,6 +431,7 @@ def _has(values: dict[str, Any], path: Sequence[str], may_be_empty: bool) -> boo
 
 
 def _check_resumable(resumed: TrainConfig, config: TrainConfig) -> None:
+    """Raises UserError where a resumed run would be another training."""
     if changed := differing_keys(resumed, config) - RESUMABLE_KEYS:
         raise UserError(
             f"a resumed run cannot change {', '.join(sorted(changed))}; leave those out, or start "
@@ -447,7 +458,9 @@ def read_preset(
       UserError: as `read_layers` and `Layers.config`.
     """
     files = (config,) if isinstance(config, Path) else tuple(config or ())
-    for layer in reversed(_layers_of_files(file for file in files if os.path.isfile(file))):
-        task = task or layer.values.get("task")
+    if task is None:
+        # In place of the word, which no user says here.
+        for file in filter(os.path.isfile, files):
+            task = read_config_file(file).get("task", task)
     choice = Choice(word=task, config=files, robot=robot, world=world)
     return read_layers(choice, machine).config()

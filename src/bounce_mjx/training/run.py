@@ -197,9 +197,9 @@ def train(
         files = config
     of_start = {key: settings[key] for key in ("algorithm", "log_dir") if key in settings}
     of_start["warm_start"] = warm_start
-    begun = find_start(word, validate(StartFlags, of_start, PYTHON), whole)
-    given = {"config": files, "robot": robot, "world": world}
-    layers = layers_on(begun, validate(FileFlags, given, PYTHON))
+    beginning = find_start(word, validate(StartFlags, of_start, PYTHON), whole)
+    of_files = {"config": files, "robot": robot, "world": world}
+    layers = layers_on(beginning, validate(FileFlags, of_files, PYTHON))
     config = layers.config(settings)
     set_up_jax(config.env)
     console = stdout(quiet=quiet or not hosts.is_leader())
