@@ -348,9 +348,8 @@ def test_files_of_the_user_lie_on_each_other(presets: Path) -> None:
         files = train_command.read_command(flags.split()).flags.config
         cpu, named, given = preset_files(files, config.task)
         assert [file.path for file in cpu] == [resource_path("configs/cpu.yaml")] and not named
-        assert " ".join(str(file.path) for file in given) == flags.replace("--config=", "").replace(
-            "--config ", ""
-        )
+        words = flags.replace("--config=", "").replace("--config ", "")
+        assert " ".join(str(file.path) for file in given) == words
     (presets / "more.yaml").write_text("base: randomized")
     with pytest.raises(UserError, match="more.yaml lies on my.yaml, so its base is not used"):
         read_preset([Path("my.yaml"), Path("more.yaml")])

@@ -126,10 +126,12 @@ def read_command(args: Sequence[str]) -> TrainCommand:
         usual = layers_on(start, first, default_preset(has_plugin())).config()
         _print_help(fields, usual, is_short="--help-all" not in helps)
     given = read_flags(fields, words, prog=PROG, description=ABOUT, defaults={})
-    if given.get("word") != word:
+    late_word = given.get("word")
+    if late_word != word:
+        # Refuses what is none, such as a second value of a flag.
+        find_start(late_word, first)
         raise UserError(
-            f"{given['word']} is what the training begins with; give it first: {PROG} "
-            f"{given['word']} ..."
+            f"{late_word} is what the training begins with; give it first: {PROG} {late_word} ..."
         )
     flags = typed(TrainFlags, given, flag_names(fields), PROG)
     said = {key: value for key, value in given.items() if key in start.fields}

@@ -229,6 +229,8 @@ def run_of(place: Path) -> Path:
     for folder in (place, *Path(os.path.abspath(place)).parents):
         if (folder / CONFIG_FILE).is_file():
             return folder
+    if runs := runs_in(place):
+        raise UserError(f"{place} is a folder of runs; give one of them, such as {runs[-1]}")
     raise UserError(
         f"{place} is not in a run's folder, as there is no {CONFIG_FILE}; give a folder that "
         "bounce-mjx train made"

@@ -87,7 +87,10 @@ def layers_on(start: Start, files: FileFlags, machine: Path | None = None) -> "L
         given = {"config": files.config, "robot": files.robot, "world": files.world}
         check_not_given(start.place, given)
         return Layers(start, (Layer(f"the run {start.place}", start.resumed.model_dump()),))
-    read = _whole_layers(start) or _layers_of_config(start, files.config, machine)
+    if start.whole is None:
+        read = _layers_of_config(start, files.config, machine)
+    else:
+        read = _layers_of_whole(start.whole, start.warm_start)
     changed = _changed_defaults(start.algorithm_config)
     trained = None if start.policy is None else start.policy.env
     of_env = layers_of_environment(start.task, trained, files.robot, files.world)
@@ -133,12 +136,13 @@ def _layers_of_config(start: Start, config: Sequence[Path], machine: Path | None
     return read
 
 
-def _whole_layers(start: Start) -> ConfigLayers | None:
-    """A whole config of Python, which has nothing below it; None without one."""
-    if start.whole is None:
-        return None
-    # The policy of its warm start is the checkpoint that was found.
-    values = start.whole.model_dump() | {"warm_start": start.warm_start}
+def _layers_of_whole(whole: TrainConfig, warm_start: Path | None) -> ConfigLayers:
+    """The layer of a whole config of Python, which has no preset below it.
+
+    Args:
+      warm_start: the policy that was found for its own.
+    """
+    values = whole.model_dump() | {"warm_start": warm_start}
     return ConfigLayers([], [], [Layer("config", values, replaces=("env", "ppo"))])
 
 

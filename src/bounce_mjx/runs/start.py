@@ -124,6 +124,9 @@ def find_start(word: str | None, flags: StartFlags, whole: TrainConfig | None = 
 
     if means_newest(Path(word)) or os.path.isdir(word):
         return _start_of_run(Path(word), flags, whole)
+    if os.path.isfile(word):
+        flag = "--import" if word.endswith(".py") else "--config"
+        raise UserError(f"{word} is a file, and no task, policy or run; give {flag} {word}")
     known = list(dict.fromkeys((*registered_tasks(), *POLICIES)))
     own = "a run's folder, or --import FILE.py for a task of your own"
     advice = suggest(word, [*known, LATEST]) or f"give {', '.join(known)}, {own}"

@@ -53,6 +53,14 @@ class Run:
         object.__setattr__(self, "folder", policy_path(self.folder))
 
     @property
+    def _name(self) -> str:
+        """What a user calls it: a policy by its name, a run by its folder."""
+        for policy in POLICIES:
+            if policy_path(policy) == self.folder:
+                return policy
+        return str(self.folder)
+
+    @property
     def config(self) -> TrainConfig:
         """The run's config."""
         return load_run_config(self.folder)
@@ -110,7 +118,7 @@ class Run:
           UserError: the environment has another task, arm, action, control step or observation than
             that of the policy's training.
         """
-        name = next((x for x in POLICIES if policy_path(x) == self.folder), str(self.folder))
+        name = self._name
         config = self.config.env
         advice = f"make the environment with policy={name!r}, or take Run({name!r}).env()"
         for found in environments_in(env):
