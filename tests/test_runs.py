@@ -149,6 +149,11 @@ def test_a_run_is_opened_by_its_path_and_reads_its_policy_once(trained: Path, mo
     assert run.folder == trained and run.results == load_results(trained).best
     assert run.checkpoint == find_checkpoint(str(trained)) == find_checkpoint(trained)
     assert actions[0].shape == (6,) and np.array_equal(*actions) and len(reads) == 1
+    checkpoint = Run(run.checkpoint.folder)
+    assert (checkpoint.config, checkpoint.checkpoint) == (run.config, run.checkpoint)
+    for attribute in ("config", "checkpoint", "policy"):
+        with pytest.raises(UserError, match="is a folder of runs; give one of them, such as"):
+            getattr(Run(trained.parent), attribute)
 
 
 def counted(function: Callable, calls: list) -> Callable:

@@ -29,7 +29,7 @@ from bounce_mjx.interrupt import StopRequest, in_daemon_thread
 from bounce_mjx.reports.tables import details_line, results_table, seeds_table, unsolved_line
 from bounce_mjx.resources import POLICIES, policy_path
 from bounce_mjx.runs import folders
-from bounce_mjx.runs.checkpoints import read_actor
+from bounce_mjx.runs.checkpoints import read_actor, read_record
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.layers import FLAGS, PYTHON, Layers, layers_on
 from bounce_mjx.runs.progress import load_results
@@ -47,7 +47,8 @@ class Run:
     those of the best one."""
 
     folder: Path
-    """The folder, or the name of a policy that comes with the package, such as robust."""
+    """The folder; a checkpoint in it, in place of the best one; or the name of a policy that comes
+    with the package, such as robust."""
 
     def __post_init__(self):
         object.__setattr__(self, "folder", policy_path(self.folder))
@@ -63,7 +64,7 @@ class Run:
     @property
     def config(self) -> TrainConfig:
         """The run's config."""
-        return load_run_config(self.folder)
+        return load_run_config(folders.run_of(self.folder))
 
     @property
     def seeds(self) -> tuple["Run", ...]:
@@ -77,8 +78,12 @@ class Run:
 
     @property
     def results(self) -> Report | None:
-        """The results of the best checkpoint; None before the first evaluation."""
-        found = load_results(self.checkpoint.run)
+        """The results of the best checkpoint; None before the first evaluation. Those of another
+        checkpoint are of the evaluation after which it was saved, if there was one."""
+        checkpoint = self.checkpoint
+        if checkpoint != folders.best_checkpoint(checkpoint.run):
+            return read_record(checkpoint).report
+        found = load_results(checkpoint.run)
         return None if found is None else found.best
 
     @property
