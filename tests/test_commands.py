@@ -39,6 +39,10 @@ def run(trained: Path, tmp_path: Path) -> Path:
 MISTAKES = (
     ("train --no-stop-if-solved", "did you mean --no-stop-when-solved?"),
     ("train --num-envs abc", "--num-envs is abc", "integer"),
+    (
+        "train --hidden-layers x y",
+        "must be a valid integer, unable to parse string as an integer (",
+    ),
     # Also printed, since training refuses it.
     (
         "train --rollout-length 201 --training-episode-seconds 2 --print-config",
