@@ -43,7 +43,7 @@ from bounce_mjx.runs.start import Choice
 from bounce_mjx.training import hosts, job, saving
 from bounce_mjx.training.events import Event
 from bounce_mjx.training.faults import first_block_fault
-from bounce_mjx.training.saving import Saver
+from bounce_mjx.training.run import Run
 from bounce_mjx.training.trainer import Snapshot
 from tiny_runs import contents
 
@@ -300,6 +300,8 @@ def test_a_history_of_checkpoints_stays_where_it_is_asked_for(tmp_path: Path) ->
     run = train(tmp_path / "all", returns, keep_checkpoints="all")
     assert stored(run) == [1, 2, 3, 4]
     assert iterations_of(find_checkpoint(run / f"checkpoints/{3 * BLOCK}")) == 3
+    for place, mean_return in ((run, 9.0), (run / f"checkpoints/{3 * BLOCK}", 5.0)):
+        assert Run(place).results.details["mean_return"] == mean_return
     third = run / f"checkpoints/{2 * BLOCK}"
     returns = {1: 9.0, 3: 6.0, 4: 7.0, 5: 8.0}
     train(tmp_path / "all", returns, third, keep_checkpoints="all")
@@ -500,7 +502,7 @@ def test_a_signal_saves_and_says_how_to_resume(tmp_path: Path, number: signal.Si
 
 
 def test_a_signal_during_the_last_save_is_not_lost(tmp_path: Path, monkeypatch) -> None:
-    start = Saver.start
+    start = saving.Saver.start
 
     def interrupted(self, snapshot, steps, about):
         # That of the final results has no state.
@@ -508,7 +510,7 @@ def test_a_signal_during_the_last_save_is_not_lost(tmp_path: Path, monkeypatch) 
             os.kill(os.getpid(), signal.SIGTERM)
         start(self, snapshot, steps, about)
 
-    monkeypatch.setattr(Saver, "start", interrupted)
+    monkeypatch.setattr(saving.Saver, "start", interrupted)
     with pytest.raises(job.TrainingStopped, match="after 128 steps, after the final evaluation"):
         train(tmp_path, {1: 5.0, 2: 9.0})
     (run,) = tmp_path.iterdir()

@@ -149,6 +149,11 @@ def test_a_run_is_opened_by_its_path_and_reads_its_policy_once(trained: Path, mo
     assert run.folder == trained and run.results == load_results(trained).best
     assert run.checkpoint == find_checkpoint(str(trained)) == find_checkpoint(trained)
     assert actions[0].shape == (6,) and np.array_equal(*actions) and len(reads) == 1
+    checkpoint = Run(run.checkpoint.folder)
+    assert (checkpoint.config, checkpoint.checkpoint) == (run.config, run.checkpoint)
+    for attribute in ("config", "checkpoint", "policy"):
+        with pytest.raises(UserError, match="is a folder of runs; give one of them, such as"):
+            getattr(Run(trained.parent), attribute)
 
 
 def counted(function: Callable, calls: list) -> Callable:
@@ -347,8 +352,9 @@ def test_files_of_the_user_lie_on_each_other(presets: Path) -> None:
         assert config.ppo.num_envs == read_preset(None).ppo.num_envs
         files = train_command.read_command(flags.split()).flags.config
         cpu, named, given = preset_files(files, config.task)
-        assert (cpu, named) == ([resource_path("configs/cpu.yaml")], [])
-        assert " ".join(map(str, given)) == flags.replace("--config=", "").replace("--config ", "")
+        assert [file.path for file in cpu] == [resource_path("configs/cpu.yaml")] and not named
+        words = flags.replace("--config=", "").replace("--config ", "")
+        assert " ".join(str(file.path) for file in given) == words
     (presets / "more.yaml").write_text("base: randomized")
     with pytest.raises(UserError, match="more.yaml lies on my.yaml, so its base is not used"):
         read_preset([Path("my.yaml"), Path("more.yaml")])

@@ -1,5 +1,5 @@
-"""The environment with the interfaces of other libraries. Each class wraps an `Env`, which
-`bounce_mjx.environment` makes, and has it as `core`; those around another class wrap one of that:
+"""The environment with the interfaces of other libraries. A class wraps an `Env`, which
+`bounce_mjx.environment` makes, and has it as `core`; or it wraps another class of these, as said:
 
 | library | class | in |
 |---|---|---|

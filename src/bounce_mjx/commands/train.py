@@ -126,10 +126,12 @@ def read_command(args: Sequence[str]) -> TrainCommand:
         usual = layers_on(start, first, default_preset(has_plugin())).config()
         _print_help(fields, usual, is_short="--help-all" not in helps)
     given = read_flags(fields, words, prog=PROG, description=ABOUT, defaults={})
-    if given.get("word") != word:
+    late_word = given.get("word")
+    if late_word != word:
+        # Refuses what is none, such as a second value of a flag.
+        find_start(late_word, first)
         raise UserError(
-            f"{given['word']} is what the training begins with; give it first: {PROG} "
-            f"{given['word']} ..."
+            f"{late_word} is what the training begins with; give it first: {PROG} {late_word} ..."
         )
     flags = typed(TrainFlags, given, flag_names(fields), PROG)
     said = {key: value for key, value in given.items() if key in start.fields}
@@ -206,10 +208,15 @@ def train(command: TrainCommand, settings: Settings) -> None:
     with hosts.leave_on_user_error():
         if flags.on_several_hosts:
             # JAX must not be asked for its devices before.
-            numbers = flags.num_processes, flags.process_id, flags.host_timeout
-            hosts.join(flags.coordinator_address, *numbers)
+            hosts.join(
+                flags.coordinator_address,
+                flags.num_processes,
+                flags.process_id,
+                limit=flags.host_timeout,
+            )
         layers, config = _for_devices(command, settings)
-        console, callbacks = stdout(quiet=not hosts.is_leader()), []
+        console = stdout(quiet=not hosts.is_leader())
+        callbacks = []
         is_watched = flags.watch and hosts.is_leader()
         if is_watched:
             # Only a training run that is watched pays for this import.

@@ -175,9 +175,9 @@ class WhichPolicy(StrictModel):
         """
         if self.log_dir is None:
             return runs_folder(find_task(self.task or DEFAULT))
-        from bounce_mjx.runs.folders import check_newest
+        from bounce_mjx.runs.folders import check_log_dir
 
-        check_newest(paths)
+        check_log_dir(paths)
         return self.log_dir
 
     @staticmethod

@@ -83,10 +83,10 @@ def describe(
     if first["type"].startswith(("greater_than", "less_than")) and key in fields:
         reason += f" {unit_of(fields[key].description or '')}".rstrip()
     for other in error.errors()[1:]:
-        # Of a union, each member says what it accepts.
-        text = other["msg"].removeprefix("Input should ")
-        if _setting_of(".".join(_path(other, group)), fields) == key and text != other["msg"]:
-            reason += f", or {text}"
+        # Each member of a union says what it accepts of the same value.
+        is_of_setting = _setting_of(".".join(_path(other, group)), fields) == key
+        if is_of_setting and _items(other) == _items(first):
+            reason += f", or {other['msg'].removeprefix('Input should ')}"
     given = shorten(str(first["input"]))
     return f"{flags.get(key, key)} is {given}, but {reason.replace('input should', 'must', 1)}"
 
@@ -153,6 +153,11 @@ def key_of(error: pydantic.ValidationError, group: str = "") -> str:
 def path_of(error: pydantic.ValidationError, group: str = "") -> list[str]:
     """The names of `key_of`, of which an unknown one may have dots itself."""
     return _path(error.errors()[0], group)
+
+
+def _items(mistake: Mapping[str, Any]) -> list[int]:
+    """The numbers of the items of nested lists in which pydantic found a mistake."""
+    return [part for part in mistake["loc"] if isinstance(part, int)]
 
 
 def _path(mistake: Mapping[str, Any], group: str) -> list[str]:

@@ -229,25 +229,30 @@ def run_of(place: Path) -> Path:
     for folder in (place, *Path(os.path.abspath(place)).parents):
         if (folder / CONFIG_FILE).is_file():
             return folder
+    if runs := runs_in(place):
+        raise UserError(f"{place} is a folder of runs; give one of them, such as {runs[-1]}")
     raise UserError(
         f"{place} is not in a run's folder, as there is no {CONFIG_FILE}; give a folder that "
         "bounce-mjx train made"
     )
 
 
-def is_newest(path: Path | None) -> bool:
-    """Whether what the user gives as a run stands for the newest one: nothing, or `LATEST` unless
-    there is a folder with that name."""
+def means_newest(path: Path | None) -> bool:
+    """Whether what the user gives as a run means the newest one: nothing, or `LATEST` unless there
+    is a folder with that name."""
     return path is None or (str(path) == LATEST and not os.path.isdir(path))
 
 
-def check_newest(paths: Sequence[Path | None]) -> None:
-    """Checks that the newest run is looked for, where the user says in which folder.
+def check_log_dir(paths: Sequence[Path | None]) -> None:
+    """Checks that --log-dir, where the newest run is looked for, has an effect.
+
+    Args:
+      paths: what the user gives as runs.
 
     Raises:
-      UserError: each path is that of a run or a policy.
+      UserError: each is that of a run or a policy.
     """
-    if not any(map(is_newest, paths)):
+    if not any(map(means_newest, paths)):
         raise UserError(
             f"--log-dir is where the newest run is looked for, and {paths[0]} is named; omit one "
             "of them"
@@ -255,9 +260,9 @@ def check_newest(paths: Sequence[Path | None]) -> None:
 
 
 def place_or_newest(path: Path | None, log_dir: Path) -> Path:
-    """The place that the user names; where that is none (`is_newest`), the newest run with a
+    """The place that the user names; where that is none (`means_newest`), the newest run with a
     checkpoint in `log_dir`."""
-    if not is_newest(path):
+    if not means_newest(path):
         return path
     if not (found := runs_in(log_dir)):
         raise UserError(

@@ -28,7 +28,14 @@ from bounce_mjx.config.validation import describe, groups_of, path_of
 from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.learning.config import NETWORK_KEYS, PPOConfig
 from bounce_mjx.runs.config import DEFAULT_SOURCE, RESUMABLE_KEYS, TrainConfig
-from bounce_mjx.runs.presets import BASE, SOURCES, preset_files, read_config_file, shown_file
+from bounce_mjx.runs.presets import (
+    BASE,
+    SOURCES,
+    ConfigFile,
+    preset_files,
+    read_config_file,
+    shown_file,
+)
 from bounce_mjx.runs.start import Choice, FileFlags, Start, check_not_given, find_start
 from bounce_mjx.runs.worlds import Layer, layers_of_environment
 from bounce_mjx.world.named import without_idle_curriculum
@@ -80,7 +87,10 @@ def layers_on(start: Start, files: FileFlags, machine: Path | None = None) -> "L
         given = {"config": files.config, "robot": files.robot, "world": files.world}
         check_not_given(start.place, given)
         return Layers(start, (Layer(f"the run {start.place}", start.resumed.model_dump()),))
-    read = _whole_layers(start) or _layers_of_config(start, files.config, machine)
+    if start.whole is None:
+        read = _layers_of_config(start, files.config, machine)
+    else:
+        read = _layers_of_whole(start.whole, start.warm_start)
     changed = _changed_defaults(start.algorithm_config)
     trained = None if start.policy is None else start.policy.env
     of_env = layers_of_environment(start.task, trained, files.robot, files.world)
@@ -126,12 +136,13 @@ def _layers_of_config(start: Start, config: Sequence[Path], machine: Path | None
     return read
 
 
-def _whole_layers(start: Start) -> ConfigLayers | None:
-    """A whole config of Python, which has nothing below it; None without one."""
-    if start.whole is None:
-        return None
-    # The policy of its warm start is the checkpoint that was found.
-    values = start.whole.model_dump() | {"warm_start": start.warm_start}
+def _layers_of_whole(whole: TrainConfig, warm_start: Path | None) -> ConfigLayers:
+    """The layer of a whole config of Python, which has no preset below it.
+
+    Args:
+      warm_start: the policy that was found for its own.
+    """
+    values = whole.model_dump() | {"warm_start": warm_start}
     return ConfigLayers([], [], [Layer("config", values, replaces=("env", "ppo"))])
 
 
@@ -159,14 +170,12 @@ def _check_start(layer: Layer, start: Start) -> None:
             )
 
 
-def _layers_of_files(files: Iterable[Path]) -> list[Layer]:
-    """A layer of each file."""
+def _layers_of_files(files: Iterable[ConfigFile]) -> list[Layer]:
+    """A layer of each file, with its settings alone."""
     layers = []
-    for file in files:
-        values = read_config_file(file)
-        values.pop(BASE, None)
-        values.pop(SOURCES, None)
-        layers.append(Layer(shown_file(file), values))
+    for path, values in files:
+        settings = {key: value for key, value in values.items() if key not in (BASE, SOURCES)}
+        layers.append(Layer(shown_file(path), settings))
     return layers
 
 
@@ -342,6 +351,11 @@ class Layers:
         return []
 
     def _validated(self, values: dict[str, Any]) -> TrainConfig:
+        """The typed config of nested values.
+
+        Raises:
+          _Mistake: a key is unknown, or a value is out of range.
+        """
         groups = {"env": self.start.task.Config, "ppo": self.start.algorithm_config}
         typed = dict(values)
         for name, kind in groups.items():
@@ -421,6 +435,7 @@ def _has(values: dict[str, Any], path: Sequence[str], may_be_empty: bool) -> boo
 
 
 def _check_resumable(resumed: TrainConfig, config: TrainConfig) -> None:
+    """Raises UserError where a resumed run would be another training."""
     if changed := differing_keys(resumed, config) - RESUMABLE_KEYS:
         raise UserError(
             f"a resumed run cannot change {', '.join(sorted(changed))}; leave those out, or start "
@@ -447,7 +462,9 @@ def read_preset(
       UserError: as `read_layers` and `Layers.config`.
     """
     files = (config,) if isinstance(config, Path) else tuple(config or ())
-    for layer in reversed(_layers_of_files(file for file in files if os.path.isfile(file))):
-        task = task or layer.values.get("task")
+    if task is None:
+        # In place of the word, which no user says here.
+        for file in filter(os.path.isfile, files):
+            task = read_config_file(file).get("task", task)
     choice = Choice(word=task, config=files, robot=robot, world=world)
     return read_layers(choice, machine).config()

@@ -120,10 +120,13 @@ def find_start(word: str | None, flags: StartFlags, whole: TrainConfig | None = 
             )
         return _new_start(None, Path(word), flags, whole)
     # Imports JAX, which a task's help does not need.
-    from bounce_mjx.runs.folders import LATEST, is_newest
+    from bounce_mjx.runs.folders import LATEST, means_newest
 
-    if is_newest(Path(word)) or os.path.isdir(word):
+    if means_newest(Path(word)) or os.path.isdir(word):
         return _start_of_run(Path(word), flags, whole)
+    if os.path.isfile(word):
+        flag = "--import" if word.endswith(".py") else "--config"
+        raise UserError(f"{word} is a file, and no task, policy or run; give {flag} {word}")
     known = list(dict.fromkeys((*registered_tasks(), *POLICIES)))
     own = "a run's folder, or --import FILE.py for a task of your own"
     advice = suggest(word, [*known, LATEST]) or f"give {', '.join(known)}, {own}"
@@ -212,10 +215,10 @@ def check_not_given(run: Path, given: Mapping[str, Any]) -> None:
 
 def _start_of_run(word: Path, flags: StartFlags, whole: TrainConfig | None) -> Start:
     """The start of a run that is resumed."""
-    from bounce_mjx.runs.folders import check_newest, place_or_newest, run_of
+    from bounce_mjx.runs.folders import check_log_dir, place_or_newest, run_of
 
     if flags.log_dir is not None:
-        check_newest([word])
+        check_log_dir([word])
     given = {"algorithm": flags.algorithm, "warm_start": flags.warm_start, "config": whole}
     check_not_given(word, given)
     # Without a folder, latest is the newest run of the default task.
