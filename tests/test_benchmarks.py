@@ -203,6 +203,7 @@ def test_one_world_spans_all_conditions_without_an_end(endless) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("quick_compilation")
 def test_a_policy_without_delays_loses_each_ball_of_a_late_world(
     endless, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
