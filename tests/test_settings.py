@@ -21,7 +21,8 @@ from bounce_mjx.config.user_code import import_code
 from bounce_mjx.errors import UserError
 from bounce_mjx.runs import presets
 from bounce_mjx.runs.config import TrainConfig, load_run_config
-from bounce_mjx.runs.folders import create_run, find_checkpoint
+from bounce_mjx.runs.creation import create_run
+from bounce_mjx.runs.folders import find_checkpoint
 from bounce_mjx.runs.layers import read_layers, read_preset
 from bounce_mjx.runs.start import Choice
 from bounce_mjx.training import job
