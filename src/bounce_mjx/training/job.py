@@ -256,8 +256,8 @@ class Job:
             # With one seed, what was trained after a checkpoint that the user named does not count
             # any more. A seed's own folder has its best policy alone.
             seed.recall_best(newest=checkpoint if seed.run == self.run else None)
-        counted = folders.stored_checkpoints(self.run)
-        self.saver.recall(x.number for x in counted if x.number <= checkpoint.number)
+        numbers = [stored.number for stored in folders.stored_checkpoints(self.run)]
+        self.saver.recall(number for number in numbers if number <= checkpoint.number)
         # Every process has read what the leader renames.
         hosts.wait_for_all()
         self.set_damaged_aside()

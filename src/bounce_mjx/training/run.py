@@ -202,11 +202,13 @@ def train(
     word = None if start is None else str(start)
     if isinstance(start, type):
         word = task_name(start)
-    whole = config if isinstance(config, TrainConfig) else None
+    whole: TrainConfig | None = None
     files: Sequence[str | Path] = ()
-    if isinstance(config, str | Path):
+    if isinstance(config, TrainConfig):
+        whole = config
+    elif isinstance(config, str | Path):
         files = (config,)
-    elif whole is None:
+    else:
         files = config
     of_start = {key: settings[key] for key in ("algorithm", "log_dir") if key in settings}
     of_start["warm_start"] = warm_start
