@@ -237,9 +237,11 @@ def test_a_whole_config_stands_alone_below_what_python_says() -> None:
         ({"task": "catch"}, "task is the first argument: train('catch', ...)"),
         ({"resume": "runs/x"}, "resume is the first argument: train('runs/x', ...)"),
         ({"num_envs": 0}, "train: ppo.num_envs is 0, but must be greater than or equal to 1"),
+        ({"start": whole}, "the first argument is a config; give it by name: train(config=...)"),
+        ({"config": {"seed": 1}}, "config is a mapping; give its keys as arguments: train(..., **"),
     ):
         with pytest.raises(UserError) as caught:
-            bounce_mjx.train(config=whole, quiet=True, **arguments)
+            bounce_mjx.train(**{"config": whole, "quiet": True} | arguments)
         assert sentence in str(caught.value)
 
 
