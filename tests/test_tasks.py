@@ -54,7 +54,10 @@ RESULT = r"rests +episodes"
 
 @pytest.mark.slow
 def test_a_task_without_events_goes_through_every_command(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    quick_compilation: None,
 ) -> None:
     """It has no goal, event, curve, marker or plot."""
     monkeypatch.chdir(tmp_path)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import yaml
 
+import tiny_runs
 from bounce_mjx.commands import train as train_command
 from bounce_mjx.config.user_code import import_code
 from bounce_mjx.env.env import Env
@@ -44,7 +45,8 @@ def first(tmp_path_factory: pytest.TempPathFactory) -> Path:
     log_dir = tmp_path_factory.mktemp("first") / "runs"
     flags = ["--critic-metrics", "n_bounces", "world/*", "--total-steps", str(STEPS)]
     terms = "--randomization.restitution 0.7 0.9 --randomization.air-drag 0.0 0.2".split()
-    train_command.main([*TINY, *flags, *terms, "--no-report", "--log-dir", str(log_dir)])
+    with tiny_runs.quick_compilation():
+        train_command.main([*TINY, *flags, *terms, "--no-report", "--log-dir", str(log_dir)])
     (run,) = log_dir.iterdir()
     return run
 
@@ -89,7 +91,9 @@ def test_the_value_network_keeps_the_terms_of_both_worlds_and_is_blind_to_new_on
 
 
 @pytest.mark.slow
-def test_a_training_starts_with_the_policy_of_the_run(first: Path, tmp_path: Path) -> None:
+def test_a_training_starts_with_the_policy_of_the_run(
+    first: Path, tmp_path: Path, quick_compilation: None
+) -> None:
     """Its first evaluation, before any step, is that of the run's policy."""
     args = [*TINY[: TINY.index("--hidden-layers")], *TINY[TINY.index("--block-steps") :]]
     args = [x for x in args if x not in ("--episode-seconds", "0.5")]
