@@ -34,12 +34,12 @@ from bounce_mjx.runs.folders import (
     best_checkpoint,
     find_checkpoint,
     latest_checkpoint,
-    lock_run,
     place_or_newest,
     stored_checkpoints,
 )
 from bounce_mjx.runs.layers import read_layers
 from bounce_mjx.runs.start import Choice
+from bounce_mjx.runs.storage import lock_run
 from bounce_mjx.training import hosts, job, saving
 from bounce_mjx.training.events import Event
 from bounce_mjx.training.faults import first_block_fault

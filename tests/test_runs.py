@@ -25,18 +25,17 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.results import Report, Result
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.model import fingerprint, load_model
-from bounce_mjx.runs import folders
+from bounce_mjx.runs import creation
 from bounce_mjx.runs import presets as presets_module
 from bounce_mjx.runs.checkpoints import read_record
 from bounce_mjx.runs.config import TrainConfig, load_run_config
+from bounce_mjx.runs.creation import create_run, save_config
 from bounce_mjx.runs.folders import (
     best_checkpoint,
     choose_checkpoint,
-    create_run,
     find_checkpoint,
     latest_checkpoint,
     place_or_newest,
-    save_config,
 )
 from bounce_mjx.runs.layers import read_preset
 from bounce_mjx.runs.presets import preset_files
@@ -362,7 +361,7 @@ def test_files_of_the_user_lie_on_each_other(presets: Path) -> None:
 
 def test_a_run_that_cannot_be_written_leaves_no_folder(tmp_path: Path, monkeypatch) -> None:
     full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-    monkeypatch.setattr(folders, "write_atomically", unittest.mock.Mock(side_effect=full))
+    monkeypatch.setattr(creation, "write_atomically", unittest.mock.Mock(side_effect=full))
     with pytest.raises(UserError, match="cannot be written .No space left on device"):
         create_run(TrainConfig(log_dir=tmp_path))
     assert not list(tmp_path.iterdir())

@@ -26,7 +26,8 @@ from bounce_mjx.runs.checkpoints import (
     save_checkpoint,
 )
 from bounce_mjx.runs.config import TrainConfig, load_run_config
-from bounce_mjx.runs.folders import best_checkpoint, create_run, find_checkpoint
+from bounce_mjx.runs.creation import create_run
+from bounce_mjx.runs.folders import best_checkpoint, find_checkpoint
 from bounce_mjx.runs.layers import layers_on
 from bounce_mjx.runs.start import FileFlags, StartFlags, find_start
 from tiny_runs import STEPS, TINY, settings_of

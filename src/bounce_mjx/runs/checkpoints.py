@@ -45,6 +45,7 @@ from bounce_mjx.runs.config import (
     load_run_config,
     without_own_settings,
 )
+from bounce_mjx.runs.creation import create_run
 from bounce_mjx.runs.records import RECORD, Checkpoint, DamagedCheckpoint, Record, verify
 from bounce_mjx.runs.storage import plain_path, seal, to_plain
 from bounce_mjx.task.registry import DEFAULT
@@ -293,7 +294,7 @@ def write_run(config: TrainConfig, steps: int, policy: Policy) -> Path:
     Raises:
       UserError: the folder cannot be written.
     """
-    run = folders.create_run(config)
+    run = create_run(config)
     save_checkpoint(run, config, steps, {POLICY: policy})
     return run
 

@@ -38,47 +38,29 @@ What finds them, and raises a `UserError` where there is nothing:
 """
 
 import contextlib
-import datetime
-import itertools
 import os
 import re
-import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from bounce_mjx.config.files import dump_config
-from bounce_mjx.config.user_code import code_file_of
 from bounce_mjx.errors import UserError, suggest, warn_once
-from bounce_mjx.lazy import mujoco
-from bounce_mjx.learning.registry import own_algorithm
 from bounce_mjx.resources import (
     POLICIES,
     PRETRAINED,
     TASK_POLICIES,
-    VERSION,
     policy_folder,
     policy_path,
     resource_path,
 )
-from bounce_mjx.runs.config import (
-    CONFIG_FILE,
-    ROBOT,
-    TrainConfig,
-    dump_sources,
-    load_run_config,
-    runs_folder,
-)
-from bounce_mjx.runs.presets import BASE
+from bounce_mjx.runs.config import CONFIG_FILE, load_run_config, runs_folder
 from bounce_mjx.runs.progress import load_results
 from bounce_mjx.runs.records import Checkpoint, DamagedCheckpoint, Record, verify
-from bounce_mjx.runs.storage import seal, writable, write_atomically
-from bounce_mjx.task.registry import DEFAULT, find_task, own_task
+from bounce_mjx.task.registry import DEFAULT, find_task
 
 LATEST = "latest"
 """Name of the newest run on the command line."""
 CHECKPOINTS = "checkpoints"
-
 
 MIRROR_LAW = Checkpoint(Path("mirror law"), Path("mirror law"), 0)
 """In place of a checkpoint, the baseline `baselines.mirror`."""
@@ -93,93 +75,6 @@ def is_users_run(run: Path) -> bool:
     return os.path.realpath(run) not in policies
 
 
-def create_run(config: TrainConfig) -> Path:
-    """Creates a new run's folder, named after the current time (UTC), with the config in it.
-
-    Raises:
-      UserError: the folder cannot be written, or the robot cannot be copied into it.
-    """
-    # Not the local time, which is another one on another machine, and in autumn goes back.
-    stamp = datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d_%H-%M-%S")
-    with writable(config.log_dir, "choose another folder with --log-dir"):
-        config.log_dir.mkdir(parents=True, exist_ok=True)
-        for copy in itertools.count(1):
-            folder = config.log_dir / (stamp if copy == 1 else f"{stamp}_{copy}")
-            with contextlib.suppress(FileExistsError):
-                folder.mkdir()
-                break
-        try:
-            save_config(folder, config)
-        except (UserError, OSError):
-            shutil.rmtree(folder, ignore_errors=True)
-            raise
-    return folder
-
-
-def save_config(run: Path, config: TrainConfig) -> None:
-    """Writes the run's resolved config, and copies of its robot and of the code of its own task and
-    algorithm, unless the run has them."""
-    own = {"task": own_task(config.task), "algorithm": own_algorithm(config.algorithm)}
-    for key, kind in own.items():
-        code = None if kind is None else code_file_of(kind)
-        if code is not None and not (run / key).exists():
-            (run / key).mkdir()
-            write_atomically(run / key / code.path.name, code.content)
-    if (mjcf := config.env.mjcf) is not None:
-        # As a config's own path is absolute and without .. in it.
-        here = Path(os.path.abspath(run))
-        if not mjcf.is_relative_to(here / ROBOT):
-            mjcf = copy_robot(mjcf, here)
-        # The run's folder may be moved.
-        env = config.env.model_copy(update={"mjcf": mjcf.relative_to(here)})
-        config = config.model_copy(update={"env": env})
-    write_config(run, config)
-
-
-def copy_robot(mjcf: Path, run: Path) -> Path:
-    """Copies an MJCF file with its meshes, textures and included files into a run's folder, sealed
-    by a manifest.
-
-    Args:
-      mjcf: a file that MuJoCo compiles, as for `locate`.
-
-    Returns:
-      The copy of the MJCF file.
-
-    Raises:
-      OSError: a file cannot be read or written.
-      UserError: the file is missing, or names another file by its absolute path.
-    """
-    from bounce_mjx.robot.arm import locate
-
-    mjcf = locate(mjcf)
-    folder = run / ROBOT
-    files = _files_of(mjcf)
-    root = Path(os.path.commonpath([path.parent for path in files]))
-    for path in files:
-        copy = folder / path.relative_to(root)
-        copy.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(path, copy)
-    seal(folder)
-    copied = folder / Path(os.path.abspath(mjcf)).relative_to(root)
-    # An absolute path in the copy still leads to the original.
-    if outside := set(_files_of(copied)) & set(files):
-        shutil.rmtree(folder)
-        raise UserError(f"{mjcf} names {min(outside)} by an absolute path; give a relative one")
-    return copied
-
-
-def _files_of(mjcf: Path) -> list[Path]:
-    """An MJCF file and every file that it names."""
-    return [Path(os.path.abspath(name)) for name in mujoco.mju_getXMLDependencies(str(mjcf))]
-
-
-def write_config(run: Path, config: TrainConfig) -> None:
-    """Writes the run's config as it is, without copies."""
-    head = f"# bounce_mjx {VERSION}\n{BASE}: null\n"
-    write_atomically(run / CONFIG_FILE, head + dump_config(config) + dump_sources(config))
-
-
 def runs_of_seeds(run: Path) -> list[Path]:
     """Existing folders of a run's seeds, such as seed_003; the run itself if it has one seed."""
     found = []
@@ -187,36 +82,6 @@ def runs_of_seeds(run: Path) -> list[Path]:
         if re.fullmatch("seed_[0-9]+", path.name) and not path.is_symlink():
             found.append(path)
     return sorted(found) or [run]
-
-
-@contextlib.contextmanager
-def lock_run(run: Path) -> Iterator[None]:
-    """Holds the lock that gives a run's folder a single writer; the kernel releases it when the
-    process dies.
-
-    On a file system without locks on folders, such as NFS, and on Windows, every process gets it.
-
-    Raises:
-      UserError: another process holds the lock.
-    """
-    try:
-        import fcntl
-    except ImportError:
-        yield
-        return
-    descriptor = os.open(run, os.O_RDONLY)
-    try:
-        # Any other OSError means that the file system has no locks.
-        with contextlib.suppress(OSError):
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as error:
-                raise UserError(
-                    f"{run} is in use by another training process; stop it, or wait for its end"
-                ) from error
-        yield
-    finally:
-        os.close(descriptor)
 
 
 def run_of(place: Path) -> Path:

@@ -36,10 +36,10 @@ from bounce_mjx.learning.policy import Policy
 from bounce_mjx.learning.registry import find_algorithm, own_algorithm
 from bounce_mjx.physics.convergence import solver_warning
 from bounce_mjx.resources import VERSION
-from bounce_mjx.runs import checkpoints, folders
+from bounce_mjx.runs import checkpoints, creation, folders
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.progress import PATIENCE, Progress, are_solved
-from bounce_mjx.runs.storage import writable
+from bounce_mjx.runs.storage import lock_run, writable
 from bounce_mjx.training import events, faults, hosts
 from bounce_mjx.training.clock import Clock
 from bounce_mjx.training.evaluators import Evaluators
@@ -144,7 +144,7 @@ def open_job(
     )
     stack.push(job.remove_unstarted)
     if hosts.is_leader():
-        stack.enter_context(folders.lock_run(run))
+        stack.enter_context(lock_run(run))
     stack.callback(job.saver.wait)
     if resume is not None:
         job.read_state(resume)
@@ -256,8 +256,8 @@ class Job:
             # With one seed, what was trained after a checkpoint that the user named does not count
             # any more. A seed's own folder has its best policy alone.
             seed.recall_best(newest=checkpoint if seed.run == self.run else None)
-        counted = folders.stored_checkpoints(self.run)
-        self.saver.recall(x.number for x in counted if x.number <= checkpoint.number)
+        numbers = [stored.number for stored in folders.stored_checkpoints(self.run)]
+        self.saver.recall(number for number in numbers if number <= checkpoint.number)
         # Every process has read what the leader renames.
         hosts.wait_for_all()
         self.set_damaged_aside()
@@ -284,7 +284,7 @@ class Job:
         for folder, config in configs.items():
             with writable(folder, "make room there or make it writable"):
                 folder.mkdir(exist_ok=True)
-                folders.save_config(folder, config)
+                creation.save_config(folder, config)
 
     def introduce(self) -> None:
         """Says what is trained, where, and for how long."""
@@ -712,7 +712,7 @@ class Job:
 
 def _make_run(config: TrainConfig) -> Path:
     """The folder of a new run, which the leader makes."""
-    made = str(folders.create_run(config)) if hosts.is_leader() else None
+    made = str(creation.create_run(config)) if hosts.is_leader() else None
     return Path(hosts.exchange(made)[0])
 
 

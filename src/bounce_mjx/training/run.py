@@ -8,7 +8,7 @@ import dataclasses
 import functools
 import shlex
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -199,14 +199,20 @@ def train(
     for name in ("task", "resume"):
         if name in settings:
             raise UserError(f"{name} is the first argument: train({str(settings[name])!r}, ...)")
+    if isinstance(start, TrainConfig):
+        raise UserError("the first argument is a config; give it by name: train(config=...)")
+    if isinstance(config, Mapping):
+        raise UserError("config is a mapping; give its keys as arguments: train(..., **config)")
     word = None if start is None else str(start)
     if isinstance(start, type):
         word = task_name(start)
-    whole = config if isinstance(config, TrainConfig) else None
+    whole: TrainConfig | None = None
     files: Sequence[str | Path] = ()
-    if isinstance(config, str | Path):
+    if isinstance(config, TrainConfig):
+        whole = config
+    elif isinstance(config, str | Path):
         files = (config,)
-    elif whole is None:
+    else:
         files = config
     of_start = {key: settings[key] for key in ("algorithm", "log_dir") if key in settings}
     of_start["warm_start"] = warm_start
