@@ -1148,6 +1148,22 @@ def judged(log: Log, servo_error: float) -> Choice:
     return choose(trials, windows, ~seen, np.full(6, 1e-4))
 
 
+def test_a_difference_is_judged_by_each_joint_in_each_window() -> None:
+    """Two unseen windows alone, in one of which servos are hardly better, would be a tie."""
+    log = following_log()
+    windows = cut_enough(log, 1e-3)
+    unseen = np.arange(len(windows.first)) < 2
+    better = np.ones_like(windows.angles)
+    worse = better.copy()
+    worse[0] = np.sqrt(1.69)
+    worse[1] = np.sqrt(1.04)
+    trials = [
+        judge(DELAY, windows, windows.angles + 1e-3 * worse, unseen),
+        judge(SERVOS, windows, windows.angles + 1e-3 * better, unseen),
+    ]
+    assert choose(trials, windows, unseen, np.full(6, 1e-4)).chosen == SERVOS
+
+
 def test_the_least_held_out_error_wins_and_ties_go_to_fewer_unknowns() -> None:
     late = judged(following_log(), 1e-4)
     assert late.chosen == DELAY and late.better is None
