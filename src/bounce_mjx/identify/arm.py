@@ -45,7 +45,7 @@ from bounce_mjx.identify.windows import Windows, is_seen
 # the rest of the delay that are a lag; the others' gains, and the shares of the delay that are
 # theirs.
 _OWN_LAG_SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
-_GAINS = (1.0, 2.0, 4.0, 8.0, 30.0)
+_GAINS = (0.3, 1.0, 2.0, 4.0, 8.0, 30.0)
 _SERVO_SHARES = (0.1, 0.3, 0.6, 0.9)
 _LAG_SHARES = (0.0, 0.3, 0.6)
 # Gains and longest own delays (s) of the servos of an arm that follows its commands exactly; and

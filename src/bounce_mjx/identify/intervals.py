@@ -15,6 +15,10 @@ _BLOCK = 2
 _LARGEST_LEVERAGE = 0.9
 # |J1 - J2| / |J1 + J2| of a window's two derivatives beyond which it has none.
 _DISAGREEMENT = 0.1
+# Error of an angle that is alike in all windows, as a share of its noise.
+_ALIKE = 0.05
+# What pictures say nothing about, as angles show it many times as well.
+_OF_ANGLES = ("delay", "delay_variance", "servo_gain", "servo_damping")
 
 
 class Certainty(NamedTuple):
@@ -49,6 +53,16 @@ def certainty(
     window's information, Q the prior's (`Layout.precision`), x - m the distance from the prior's
     mean, and e a draw of the prior: what no window shows has the prior's spread. What the model
     lacks is in the residuals r_s, and so in the spread.
+
+    *What angles show alone.* Servos move a bounce by less than the step in which it begins, so that
+    derivatives of the pictures by a gain, a damping or a delay are noise, to which thousands of
+    angles would be fitted: pictures say nothing about these (a cut, Plummer 2015, "Cuts in Bayesian
+    graphical models").
+
+    *What no log averages out.* Errors that are alike in all windows, as of an encoder's scale, a
+    gear's play, or a clock, do not become less with more rows. They may be a twentieth of an
+    angle's noise, and look like the effect of friction, of stiffness or of a delay; and a simulated
+    servo answers anywhere within a physics step (`_alike`).
 
     *What friction hides.* A servo rests anywhere within its dead band, friction / stiffness, and
     what differs between a joint's directions, or its motions, moves it there in all windows alike:
@@ -86,6 +100,8 @@ def certainty(
         linearise(problem, vector, fit.starts, np.arange(size), entries, weights, step)
         for step, weights in sides
     ]
+    for line in lines:
+        _cut(line, layout, problem.windows.angles[0].size)
     ones = _mean(lines[:2])
     twos = _mean(lines[2:])
     twos = [np.where(has_ball[:, None, None], b, a) for a, b in zip(ones, twos, strict=True)]
@@ -106,6 +122,8 @@ def certainty(
     random = np.random.default_rng(0)
     prior = layout.precision
     changes = resample(informations, gradients, is_estimated, random, prior) * scale
+    changes += _alike(problem, fit, ones[0], random)
+    changes = _within_prior(changes / scale, is_estimated) * scale
     offsets = changes[:, layout.slices["servo_offset"]]
     offsets += random.uniform(-1.0, 1.0, offsets.shape) * dead_band
     information = _positive(np.sum(informations, axis=0))
@@ -117,6 +135,56 @@ def _mean(lines: list[Linearisation]) -> tuple[np.ndarray, np.ndarray]:
     forward, backward = lines
     by_unknown = 0.5 * (forward.by_unknown + backward.by_unknown)
     return by_unknown, 0.5 * (forward.by_state + backward.by_state)
+
+
+def _cut(line: Linearisation, layout: Layout, num_angles: int) -> None:
+    """Takes what angles alone show out of the derivatives of the pictures."""
+    for name in _OF_ANGLES:
+        line.by_unknown[:, num_angles:, layout.slices[name]] = 0.0
+
+
+def _alike(
+    problem: Problem, fit: Fit, by_unknown: np.ndarray, random: np.random.Generator
+) -> np.ndarray:
+    """Changes [B, P] of the estimate by errors of the angles that are alike in all windows.
+
+    An error of `_ALIKE` noises (root mean square) passes for the effect of a joint's friction, of
+    its stiffness, with as late a servo, or of the delay of all joints. So each is known no better
+    than the change whose effect is as large.
+
+    Args:
+      by_unknown: derivatives [S, M, P] of the white residuals.
+    """
+    layout = problem.layout
+    windows = problem.windows
+    n = layout.num_joints
+    shape = windows.angles.shape
+    effects = by_unknown[:, : windows.angles[0].size].reshape(*shape, -1)
+    counts = windows.split(fit.weights)[0] > 0.0
+    # In noises of one angle, of which several may count as one.
+    units = np.sqrt(problem.correlation / np.maximum(np.sum(counts, axis=(0, 1)), 1))
+    changes = np.zeros((_RESAMPLES, len(fit.vector)))
+
+    def hide(names: tuple[str, ...], of_joints: bool) -> None:
+        """Adds what hides the unknowns of these names together, of each joint or of all."""
+        places = np.array([np.arange(len(fit.vector))[layout.slices[name]] for name in names])
+        columns = places if of_joints else np.repeat(places, n, axis=1)
+        along = sum(effects[:, :, np.arange(n), each] for each in columns)
+        sizes = units * np.sqrt(np.sum((along * counts) ** 2, axis=(0, 1)))
+        sizes = sizes if of_joints else np.mean(sizes, keepdims=True)
+        farthest = np.min(layout.deviation[places], axis=0)
+        spread = np.minimum(_ALIKE / np.maximum(sizes, 1e-12), farthest)
+        draws = spread * random.normal(size=(_RESAMPLES, len(spread)))
+        for each in places:
+            changes[:, each] += draws
+
+    hide(("joint_frictionloss",), True)
+    hide(("servo_gain", "servo_damping"), True)
+    hide(("delay_variance",), False)
+    hide(("delay",), False)
+    step = layout.physics_dt * random.uniform(-0.5, 0.5, _RESAMPLES)
+    changes[:, layout.slices["delay"].start] += step
+    return changes
 
 
 def resample(
@@ -155,7 +223,12 @@ def resample(
         information = _positive(np.einsum("s,sij->ij", weights, informations))
         slope = weights @ wider - root_precision @ random.normal(size=size)
         changes[b] = -np.linalg.solve(information + precision, slope)
-    # A log takes no knowledge away; and what no search has moved is as little known as before.
+    return _within_prior(changes, is_estimated)
+
+
+def _within_prior(changes: np.ndarray, is_estimated: np.ndarray) -> np.ndarray:
+    """Changes [B, P], in units of the prior's deviations, that spread as far as the prior at most:
+    a log takes no knowledge away. What no search has moved is as little known as before."""
     spread = np.maximum(np.std(changes, axis=0), 1e-12)
     return changes * np.where(is_estimated, np.minimum(1.0, 1.0 / spread), 1.0 / spread)
 
