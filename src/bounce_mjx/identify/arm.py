@@ -291,9 +291,14 @@ def _late_servos(layout: Layout, servos: Servos, delay: float) -> np.ndarray:
     for gain, servo_share, lag_share in itertools.product(_GAINS, _SERVO_SHARES, _LAG_SHARES):
         damping = servos.damping_for(servo_share * total, gain, ARM["servo_damping"].limits)
         # The joints' own damping may make them later than that share.
-        rest = max(total - float(np.mean(servos.delays(gain, damping))), 0.0)
+        rest = total - float(np.mean(servos.delays(gain, damping)))
         # A share of what the servo was to leave.
-        lag = min(lag_share * (1.0 - servo_share) * total, rest)
+        lag = lag_share * (1.0 - servo_share) * total
+        if rest < lag and gain < max(_GAINS):
+            # Servos so soft would be later than measured.
+            continue
+        rest = max(rest, 0.0)
+        lag = min(lag, rest)
         world = {
             "servo_gain": np.full(layout.num_joints, gain),
             "servo_damping": damping,

@@ -172,10 +172,8 @@ def _is_tie(differences: np.ndarray) -> bool:
 
 
 def _spread(values: np.ndarray) -> float:
-    """Standard deviation of the mean of values [K], by a bootstrap; one alone has none."""
+    """Standard deviation of the mean of values [K], by a bootstrap; of one alone 0."""
     count = len(values)
-    if count < 2:
-        return np.inf
     picks = np.random.default_rng(0).integers(0, count, (_RESAMPLES, count))
     return float(np.std(np.mean(values[picks], axis=1)))
 
