@@ -1,5 +1,6 @@
 """What a log says about the unknowns: estimates from resampled windows."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -122,8 +123,9 @@ def certainty(
     random = np.random.default_rng(0)
     prior = layout.precision
     changes = resample(informations, gradients, is_estimated, random, prior) * scale
-    changes += _alike(problem, fit, ones[0], random)
-    changes = _within_prior(changes / scale, is_estimated) * scale
+    # What is left of the prior's variance.
+    room = np.sqrt(np.maximum(scale**2 - np.var(changes, axis=0), 0.0)) * is_estimated
+    changes += _alike(problem, fit, ones[0], room, random)
     offsets = changes[:, layout.slices["servo_offset"]]
     offsets += random.uniform(-1.0, 1.0, offsets.shape) * dead_band
     information = _positive(np.sum(informations, axis=0))
@@ -144,46 +146,53 @@ def _cut(line: Linearisation, layout: Layout, num_angles: int) -> None:
 
 
 def _alike(
-    problem: Problem, fit: Fit, by_unknown: np.ndarray, random: np.random.Generator
+    problem: Problem,
+    fit: Fit,
+    by_unknown: np.ndarray,
+    room: np.ndarray,
+    random: np.random.Generator,
 ) -> np.ndarray:
     """Changes [B, P] of the estimate by errors of the angles that are alike in all windows.
 
     An error of `_ALIKE` noises (root mean square) passes for the effect of a joint's friction, of
     its stiffness, with as late a servo, or of the delay of all joints. So each is known no better
-    than the change whose effect is as large.
+    than the change whose effect is as large. Where several angles count as one, as their errors are
+    alike, it is so much larger.
 
     Args:
       by_unknown: derivatives [S, M, P] of the white residuals.
+      room: largest deviation [P] of these changes.
     """
     layout = problem.layout
     windows = problem.windows
-    n = layout.num_joints
     shape = windows.angles.shape
     effects = by_unknown[:, : windows.angles[0].size].reshape(*shape, -1)
     counts = windows.split(fit.weights)[0] > 0.0
-    # In noises of one angle, of which several may count as one.
-    units = np.sqrt(problem.correlation / np.maximum(np.sum(counts, axis=(0, 1)), 1))
+    numbers = np.maximum(np.sum(counts, axis=(0, 1)), 1)
+    joints = np.arange(layout.num_joints)
+    every = np.arange(len(fit.vector))
     changes = np.zeros((_RESAMPLES, len(fit.vector)))
 
-    def hide(names: tuple[str, ...], of_joints: bool) -> None:
-        """Adds what hides the unknowns of these names together, of each joint or of all."""
-        places = np.array([np.arange(len(fit.vector))[layout.slices[name]] for name in names])
-        columns = places if of_joints else np.repeat(places, n, axis=1)
-        along = sum(effects[:, :, np.arange(n), each] for each in columns)
-        sizes = units * np.sqrt(np.sum((along * counts) ** 2, axis=(0, 1)))
-        sizes = sizes if of_joints else np.mean(sizes, keepdims=True)
-        farthest = np.min(layout.deviation[places], axis=0)
-        spread = np.minimum(_ALIKE / np.maximum(sizes, 1e-12), farthest)
-        draws = spread * random.normal(size=(_RESAMPLES, len(spread)))
-        for each in places:
-            changes[:, each] += draws
+    def sizes(columns: Sequence[np.ndarray]) -> np.ndarray:
+        """Root mean square [n] of what the unknowns in columns [n] together change in each joint,
+        in units of the noise."""
+        along = sum(effects[:, :, joints, column] for column in columns)
+        return np.sqrt(np.sum((along * counts) ** 2, axis=(0, 1)) / numbers)
 
-    hide(("joint_frictionloss",), True)
-    hide(("servo_gain", "servo_damping"), True)
-    hide(("delay_variance",), False)
-    hide(("delay",), False)
-    step = layout.physics_dt * random.uniform(-0.5, 0.5, _RESAMPLES)
-    changes[:, layout.slices["delay"].start] += step
+    def hide(places: Sequence[np.ndarray], spread: np.ndarray) -> None:
+        """Changes the unknowns at these places together."""
+        spread = np.minimum(spread, np.min(room[np.array(places)], axis=0))
+        draws = spread * random.normal(size=(_RESAMPLES, len(spread)))
+        for place in places:
+            changes[:, place] += draws
+
+    for names in (("joint_frictionloss",), ("servo_gain", "servo_damping")):
+        places = [every[layout.slices[name]] for name in names]
+        hide(places, _ALIKE / np.maximum(sizes(places), 1e-12))
+    for name, least in (("delay_variance", 0.0), ("delay", layout.physics_dt / np.sqrt(12.0))):
+        place = every[layout.slices[name]]
+        size = np.mean(sizes([np.repeat(place, len(joints))]), keepdims=True)
+        hide([place], np.hypot(_ALIKE / np.maximum(size, 1e-12), least))
     return changes
 
 
@@ -223,12 +232,7 @@ def resample(
         information = _positive(np.einsum("s,sij->ij", weights, informations))
         slope = weights @ wider - root_precision @ random.normal(size=size)
         changes[b] = -np.linalg.solve(information + precision, slope)
-    return _within_prior(changes, is_estimated)
-
-
-def _within_prior(changes: np.ndarray, is_estimated: np.ndarray) -> np.ndarray:
-    """Changes [B, P], in units of the prior's deviations, that spread as far as the prior at most:
-    a log takes no knowledge away. What no search has moved is as little known as before."""
+    # A log takes no knowledge away; and what no search has moved is as little known as before.
     spread = np.maximum(np.std(changes, axis=0), 1e-12)
     return changes * np.where(is_estimated, np.minimum(1.0, 1.0 / spread), 1.0 / spread)
 
