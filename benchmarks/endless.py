@@ -65,7 +65,7 @@ def main() -> None:
         command = parse(EndlessCommand, sys.argv[1:], prog="benchmarks/endless.py", description=doc)
         records = []
         for name in command.policies:
-            checkpoint = command.choose(name, command.robot)
+            (checkpoint,) = command.choose(name, robot=command.robot)
             config = command.config_of(checkpoint, command.robot)
             world = None if command.world is None else env_in_world(config.env, command.world)
             suite = Path(__file__).with_name("endless.yaml")
@@ -114,16 +114,19 @@ def measure(
         print(f"minute {minute}: balls kept {kept.tolist()}", flush=True)
         if not kept.any():
             break
-    statistics = jax.tree.map(
-        lambda x: np.asarray(x).reshape(len(conditions), EPISODES).tolist(), now.statistics
-    )
+    statistics = now.statistics
+    size = len(conditions), EPISODES
+    kept = np.asarray(statistics.running).reshape(size).sum(axis=1)
+    bounces = np.asarray(statistics.tally.sums["hits"]).reshape(size)
+    at_the_height = np.asarray(statistics.tally.maxima["n_bounces"]).reshape(size)
+    steps = np.asarray(statistics.steps).reshape(size)
     return [
         {
             "condition": condition.perturbation.name,
-            "kept": sum(statistics.running[i]),
-            "bounces": statistics.tally.sums["hits"][i],
-            "at_the_height": statistics.tally.maxima["n_bounces"][i],
-            "steps": statistics.steps[i],
+            "kept": int(kept[i]),
+            "bounces": bounces[i].tolist(),
+            "at_the_height": at_the_height[i].tolist(),
+            "steps": steps[i].tolist(),
         }
         for i, condition in enumerate(conditions)
     ]

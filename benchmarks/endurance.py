@@ -29,7 +29,7 @@ from bounce_mjx.learning.policy import make_networks
 from bounce_mjx.reports.tables import figure_text
 from bounce_mjx.runs.checkpoints import read_policy
 from bounce_mjx.runs.config import load_run_config
-from bounce_mjx.runs.folders import find_checkpoint, run_or_newest
+from bounce_mjx.runs.folders import find_checkpoint, place_or_newest
 
 # Minimum share of environments that keep the ball up throughout.
 MIN_SHARE = 0.99
@@ -54,7 +54,7 @@ class Command(StrictModel):
 
 def measure(command: Command) -> list[dict]:
     """One record per minute."""
-    checkpoint = find_checkpoint(run_or_newest(command.checkpoint, command.log_dir))
+    checkpoint = find_checkpoint(place_or_newest(command.checkpoint, command.log_dir))
     config = load_run_config(checkpoint.run)
     env = BounceBall(config.env)
     networks = make_networks(config.ppo, env.observation_size, env.action_size)

@@ -30,14 +30,8 @@ from bounce_mjx.runs.checkpoints import (
     save_checkpoint,
 )
 from bounce_mjx.runs.config import CONFIG_FILE, ROBOT, TrainConfig, load_run_config, runs_folder
-from bounce_mjx.runs.folders import (
-    CHECKPOINTS,
-    Checkpoint,
-    best_checkpoint,
-    copy_robot,
-    find_checkpoint,
-    write_config,
-)
+from bounce_mjx.runs.creation import copy_robot, write_config
+from bounce_mjx.runs.folders import CHECKPOINTS, Checkpoint, best_checkpoint, find_checkpoint
 from bounce_mjx.runs.layers import read_preset
 from bounce_mjx.runs.progress import RESULTS_FILE, load_results
 from bounce_mjx.runs.storage import MANIFEST_FILE, to_json, write_atomically

@@ -8,6 +8,7 @@ from typing import Any
 
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.runs.config import TrainConfig
+from bounce_mjx.runs.layers import ORDER
 from bounce_mjx.world.randomization import Term
 
 _HEAD = """# Config reference
@@ -17,13 +18,15 @@ file](training.md#a-file-of-your-own) the keys are nested groups, one per sectio
 the full name without `env.` or `ppo.`, with hyphens: `--num-envs` for `ppo.num_envs`,
 `--reward.height.weight` for `env.reward.height.weight`.
 
-Later wins: the defaults, the preset of this machine, what your own algorithm changes of PPO's
-defaults, a preset that you name, the policy of a warm start, your files, a robot (`--robot`), a
-world (`--world`), the flags or arguments of `train`. `bounce-mjx train --print-config` prints the
-config with what set each value; of a run, that is `Run(FOLDER).config.sources`. Unknown keys,
-values out of range and settings without effect are refused. A list is `256 256` or `256,256` on
-the command line, and a switch `--stop-when-solved`, `--no-stop-when-solved` or
-`--stop-when-solved=false`. Whole numbers are below 2^31, steps at most 10^12 (`1e6` is one too).
+A setting may come from several places, of which a later one wins:
+
+{order}
+
+`bounce-mjx train --print-config` prints the config with what set each value; of a run, that is
+`Run(FOLDER).config.sources`. Unknown keys, values out of range and settings without effect are
+refused. A list is `256 256` or `256,256` on the command line, and a switch `--stop-when-solved`,
+`--no-stop-when-solved` or `--stop-when-solved=false`. Whole numbers are below 2^31, steps at most
+10^12 (`1e6` is one too).
 
 - `env.control_dt` is a multiple of `env.physics_dt`; an episode is whole control steps, at least
   one.
@@ -43,7 +46,9 @@ def main() -> None:
 
 def reference() -> str:
     """The whole page, Markdown."""
-    return _HEAD + "".join(_section(group, prefix) for group, prefix in _groups(TrainConfig(), ""))
+    order = "\n".join(f"{number}. {layer}" for number, layer in enumerate(ORDER, start=1))
+    sections = [_section(group, prefix) for group, prefix in _groups(TrainConfig(), "")]
+    return _HEAD.replace("{order}", order) + "".join(sections)
 
 
 def _groups(group: StrictModel, prefix: str) -> Iterator[tuple[StrictModel, str]]:

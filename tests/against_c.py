@@ -378,6 +378,12 @@ def fused_steps(model: mujoco.MjModel, parameters: PhysicsParameters, states: St
         )
 
 
+def jit_mjx(function: Callable) -> Callable:
+    """`jax.jit` of a function that steps MJX, on whose programs XLA aborts if it joins their loops,
+    as it does in the tests (`conftest.py`)."""
+    return jax.jit(function, compiler_options={"xla_backend_extra_options": ""})
+
+
 class CBatch:
     """Batch of MuJoCo simulations with their own states, and their own models or the same."""
 

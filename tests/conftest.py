@@ -12,8 +12,6 @@ import os
 import re
 import shutil
 import signal
-import subprocess
-import sys
 import tempfile
 import types
 from collections.abc import Callable, Generator, Iterator
@@ -138,25 +136,6 @@ def _complete(report: Report, config: pytest.Config) -> Report:
     return report
 
 
-@pytest.hookimpl(tryfirst=True)
-def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
-    """Tests that compile MJX run in a process of their own, as XLA aborts if it joins its loops."""
-    marked = pyfuncitem.get_closest_marker("separate_loops") is not None
-    if not marked or JOINED_LOOPS not in os.environ["XLA_FLAGS"]:
-        return None
-    command = [sys.executable, "-m", "pytest", "-q", "-n", "0", "-m", "", pyfuncitem.nodeid]
-    flags = os.environ["XLA_FLAGS"].replace(JOINED_LOOPS, "")
-    done = subprocess.run(
-        command,
-        cwd=pyfuncitem.config.rootpath,
-        env=os.environ | {"XLA_FLAGS": flags},
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stdout
-    return True
-
-
 @pytest.fixture(autouse=True)
 def _no_code_of_another_test(monkeypatch: pytest.MonkeyPatch) -> None:
     """In a process of a user's, two files may not have classes of one name."""
@@ -168,6 +147,13 @@ def _no_code_of_another_test(monkeypatch: pytest.MonkeyPatch) -> None:
 def float64() -> Iterator[None]:
     """Runs the whole test in float64."""
     with jax.enable_x64(True):
+        yield
+
+
+@pytest.fixture
+def quick_compilation() -> Iterator[None]:
+    """`tiny_runs.quick_compilation` of the whole test."""
+    with tiny_runs.quick_compilation():
         yield
 
 

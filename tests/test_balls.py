@@ -19,6 +19,7 @@ from against_c import (
     differences,
     free_run,
     hostile_states,
+    jit_mjx,
     num_pressed,
 )
 from bounce_mjx import task
@@ -158,7 +159,6 @@ def test_the_gradient_of_touching_balls_is_that_of_finite_differences(float64):
 
 
 @pytest.mark.slow
-@pytest.mark.separate_loops
 def test_mjx_agrees_on_several_balls(float64):
     """With friction, between the balls too."""
     model, count = balls_model(2, 0.3), 8
@@ -166,7 +166,7 @@ def test_mjx_agrees_on_several_balls(float64):
     some = np.flatnonzero(num_pressed(model, states) >= 2)[:count]
     states = States(*(x[some] for x in states))
     expected, _ = c_steps(model, states)
-    step = jax.jit(jax.vmap(lambda s, u: make_engine(model, "mjx").step(MODEL, s, Control(u), 1)))
+    step = jit_mjx(jax.vmap(lambda s, u: make_engine(model, "mjx").step(MODEL, s, Control(u), 1)))
     after = step(PhysicsState(*states[:2]), states.ctrl)
     error = differences(PhysicsState(*map(np.asarray, after[:2])), expected)
     error /= np.max(np.abs(expected.qvel), axis=1)

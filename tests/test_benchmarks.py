@@ -2,6 +2,7 @@
 
 import copy
 import importlib
+import json
 import re
 import subprocess
 import sys
@@ -199,6 +200,20 @@ def test_one_world_spans_all_conditions_without_an_end(endless) -> None:
     heavy = next(c for c in conditions if c.perturbation.name == "ball of 5 g")
     factor, _ = heavy.range("ball_mass")
     assert factor * config.robot.ball.mass == pytest.approx(0.005, rel=1e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("quick_compilation")
+def test_a_policy_without_delays_loses_each_ball_of_a_late_world(
+    endless, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(endless, "EPISODES", 4)
+    command = "endless.py pretrained --minutes 1 --world fast_servo --out"
+    monkeypatch.setattr(sys, "argv", [*command.split(), str(tmp_path)])
+    endless.main()
+    (record,) = json.loads((tmp_path / "endless.json").read_text())["records"]
+    assert record["world"] == "fast_servo" and record["kept"] == 0
+    assert len(record["bounces"]) == 4 and max(record["bounces"]) < 30
 
 
 @pytest.mark.parametrize("policy", ["pretrained", "ur5e"])

@@ -18,6 +18,7 @@ from brax.training.agents.ppo.networks import make_ppo_networks
 from brax.training.agents.sac import networks as sac_networks
 from brax.training.agents.sac import train as brax_sac
 
+import tiny_runs
 from bounce_mjx import EnvConfig
 from bounce_mjx.adapters.brax import (
     BraxTaskEnv,
@@ -161,15 +162,7 @@ def example(name: str) -> dict:
 
 
 @pytest.fixture(scope="module")
-def quick_compilation():
-    """The trainings of a few steps take most of their time to compile."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
-
-
-@pytest.fixture(scope="module")
-def ppo_example(quick_compilation, tmp_path_factory):
+def ppo_example(tmp_path_factory):
     """The folder and the evaluations of `examples/brax_ppo.py`."""
     folder = tmp_path_factory.mktemp("brax")
     small = {
@@ -177,7 +170,8 @@ def ppo_example(quick_compilation, tmp_path_factory):
         "num_envs": 8, "num_eval_envs": 4, "unroll_length": 5, "batch_size": 8,
         "num_minibatches": 2, "num_updates_per_batch": 2, "max_devices_per_host": 1,
     }  # fmt: skip
-    history = example("brax_ppo.py")["main"](folder, **small)
+    with tiny_runs.quick_compilation():
+        history = example("brax_ppo.py")["main"](folder, **small)
     return folder, history
 
 

@@ -25,9 +25,9 @@ from bounce_mjx.learning.ppo import PPO, TrainingState, policy_of
 from bounce_mjx.runs import checkpoints, storage
 from bounce_mjx.runs.checkpoints import read_policy, read_training, save_checkpoint
 from bounce_mjx.runs.config import TrainConfig, load_run_config
+from bounce_mjx.runs.creation import create_run
 from bounce_mjx.runs.folders import (
     best_checkpoint,
-    create_run,
     find_checkpoint,
     latest_checkpoint,
     stored_checkpoints,

@@ -39,6 +39,10 @@ def run(trained: Path, tmp_path: Path) -> Path:
 MISTAKES = (
     ("train --no-stop-if-solved", "did you mean --no-stop-when-solved?"),
     ("train --num-envs abc", "--num-envs is abc", "integer"),
+    (
+        "train --hidden-layers x y",
+        "must be a valid integer, unable to parse string as an integer (",
+    ),
     # Also printed, since training refuses it.
     (
         "train --rollout-length 201 --training-episode-seconds 2 --print-config",
@@ -61,9 +65,17 @@ MISTAKES = (
         "train --task=catch",
         "unknown argument --task=catch; its value has no flag, and stands first: [TASK|",
     ),
+    ("train --seed 3 4", "there is no task, policy or run 4; give"),
+    ("train {run}/config.yaml", "config.yaml is a file, and no task,", "give --config {run}/con"),
+    ("train {here}", "give --import {here}"),
+    ("eval {run}/..", "is a folder of runs; give one of them, such as {run}/../"),
     ("train --seed 3 catch", "catch is what the training begins with; give it first"),
     ("train cach", "no task, policy or run cach; did you mean catch?"),
     ("train robust_small --warm-start robust", "are two policies; leave one out"),
+    (
+        "train --keep-checkpoints 0",
+        "--keep-checkpoints is 0, but must be greater than or equal to 1, or be 'all'",
+    ),
     ("train --config a.yaml", "a.yaml", "No such file", "configs/default.yaml"),
     ("train --config nope", "no preset is named nope", "cpu, default, finetune"),
     ("train --robot nope", "no robot is named nope", "iiwa, panda, peitian, ur5e"),
@@ -154,7 +166,8 @@ def test_a_mistake_is_one_sentence(refused: Refuse, monkeypatch, case: tuple[str
     monkeypatch.setattr(Simulation, "__init__", None)
     line, *words = case
     run = shared_run() if "{run}" in line else None
-    refused(line.format(run=run), *(word.format(run=run) for word in words))
+    known = {"run": run, "here": __file__}
+    refused(line.format(**known), *(word.format(**known) for word in words))
 
 
 ALIASES = b"a0: &a0 [1, 2]\n" + b"".join(

@@ -39,7 +39,8 @@ from bounce_mjx.robot.model import load_model
 from bounce_mjx.runs import checkpoints
 from bounce_mjx.runs.checkpoints import save_checkpoint
 from bounce_mjx.runs.config import TrainConfig, load_run_config
-from bounce_mjx.runs.folders import find_checkpoint, save_config
+from bounce_mjx.runs.creation import save_config
+from bounce_mjx.runs.folders import find_checkpoint
 from bounce_mjx.world.randomization import EACH_JOINT, TERMS
 from bounce_mjx.world.sensing import Sensing
 from deployed import ball_over, changed_policy

@@ -478,6 +478,8 @@ def test_python_of_a_page_runs(page: str, capsys, tmp_path: Path, monkeypatch, r
 
     if page == "../README.md":
         monkeypatch.setattr(bounce_mjx, "train", lambda *_, **settings: Run(shared_run()))
+    else:
+        request.getfixturevalue("quick_compilation")
     if page == "libraries.md":
         for fixture in ("opengl", "torch_libraries"):
             request.getfixturevalue(fixture)

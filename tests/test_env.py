@@ -482,7 +482,7 @@ def test_nan_action_ends_the_episode_and_acts_as_zero(config):
 
 
 @pytest.mark.slow
-def test_gradient_through_steps_with_a_contact_equals_finite_differences():
+def test_gradient_through_steps_with_a_contact_equals_finite_differences(quick_compilation):
     """The derivative of the summed rewards of five steps, in which the ball hits the paddle, along
     a direction of the actions, against central differences of the fourth order."""
     with jax.enable_x64(True):
@@ -503,11 +503,9 @@ def test_gradient_through_steps_with_a_contact_equals_finite_differences():
             )
             return rewards.sum(), after.metrics["n_bounces"]
 
-        # Without fusion XLA compiles much faster, and the program runs only a few times.
-        compiled = functools.partial(jax.jit, compiler_options={"xla_disable_hlo_passes": "fusion"})
-        (_, bounces), gradient = compiled(jax.value_and_grad(total, has_aux=True))(actions)
+        (_, bounces), gradient = jax.jit(jax.value_and_grad(total, has_aux=True))(actions)
         assert bounces == 1.0
-        evaluate, step = compiled(lambda actions: total(actions)[0]), 1e-4
+        evaluate, step = jax.jit(lambda actions: total(actions)[0]), 1e-4
         near, far = (
             evaluate(actions + i * step * direction) - evaluate(actions - i * step * direction)
             for i in (1.0, 2.0)

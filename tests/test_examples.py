@@ -69,11 +69,10 @@ SHORT |= {"screening_episodes": 0, "episode_seconds": 0.5, "total_steps": 128}
 
 
 @pytest.mark.slow
-def test_notebook_shows_two_rewards_and_compares(need, opengl, tmp_path, monkeypatch):
+def test_notebook_shows_two_rewards_and_compares(need, opengl, tmp_path, quick_compilation):
     """Every cell, with a short video: the video, a table of the two runs' results, curves."""
     nbformat, nbclient = need("nbformat"), need("nbclient")
     need("ipykernel")
-    monkeypatch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
     notebook = nbformat.read(EXAMPLES / "notebook.ipynb", as_version=4)
     code = [cell for cell in notebook.cells if cell.cell_type == "code"]
     (parameters,) = (cell for cell in code if "parameters" in cell.metadata.get("tags", ()))

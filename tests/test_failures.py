@@ -138,14 +138,15 @@ def test_a_film_of_a_condition_is_its_episode(policy, tmp_path, monkeypatch) -> 
 def test_each_failure_has_its_world_and_its_time(conditions, measured) -> None:
     statistics, recording = measured
     failures = failures_of(conditions, statistics)
-    states = reset_episodes(conditions.env, jax.random.PRNGKey(SEED), EPISODES).pipeline_state
+    reset = jax.jit(lambda key: reset_episodes(conditions.env, key, EPISODES).pipeline_state)
+    states = reset(jax.random.PRNGKey(SEED))
     lost = np.flatnonzero(~statistics.running)
     assert {one.episode for one in failures} >= {*lost.tolist()} and len(lost)
     for one in failures:
         assert one.seconds == pytest.approx(recording.running[:, one.episode].sum() * 0.01)
         assert one.lasted == bool(statistics.running[one.episode])
         for name, value in one.world.items():
-            # A program that is not compiled as a whole may round once more.
+            # Another program than that of the evaluation may round once more.
             np.testing.assert_allclose(value, states.world[name][..., one.episode], atol=1e-6)
         height = states.goal["target_height"][one.episode]
         assert one.goal == {"target_height": pytest.approx(float(height))}

@@ -29,6 +29,7 @@ from against_c import (
     frictionless,
     fused_steps,
     hostile_states,
+    jit_mjx,
     num_contacts,
     num_pressed,
     paddle_frame,
@@ -124,7 +125,6 @@ def c_engine_steps(model: mujoco.MjModel, states: States) -> PhysicsState:
 
 
 @pytest.mark.slow
-@pytest.mark.separate_loops
 def test_mjx_has_the_same_friction(float64):
     """From states that stick, slip and separate; given as parameters of each environment too."""
     model = frictional()
@@ -142,7 +142,7 @@ def test_mjx_has_the_same_friction(float64):
         contact_friction=np.linspace(0.0, 0.6, count), ball_inertia=np.linspace(0.3, 0.667, count)
     )
     engine = make_engine(model, "mjx")
-    step = jax.jit(jax.vmap(lambda p, s, u: engine.step(p, s, Control(u), 1)))
+    step = jit_mjx(jax.vmap(lambda p, s, u: engine.step(p, s, Control(u), 1)))
     start = PhysicsState(*states[:2])
     own = PhysicsParameters(
         contact_friction=np.full(count, 0.3), ball_inertia=np.full(count, SOLID)

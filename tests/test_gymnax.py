@@ -34,6 +34,7 @@ def gymnax(need, monkeypatch):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("quick_compilation")
 def test_steps_are_those_of_the_task_until_the_time_limit(env):
     """The plain environment is the reference; at the limit the observation is a new episode's, and
     the last one is in the info of gymnax's form. PureJaxRL, which keeps every info, gets none of
@@ -62,6 +63,7 @@ def test_steps_are_those_of_the_task_until_the_time_limit(env):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("quick_compilation")
 def test_the_parameters_set_the_time_limit_and_a_fall_terminates(env):
     """In the form of gymnax 1.x, whose steps tell the two ends apart."""
     step = functools.partial(GymnaxTaskEnv.step, env)
@@ -108,6 +110,7 @@ def test_gymnax_own_wrapper_logs_episodes(gymnax):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("quick_compilation")
 def test_example_of_purejaxrl_trains():
     """No random key of it is used twice, which JAX can tell."""
     main = runpy.run_path(str(Path(__file__).parents[1] / "examples" / "purejaxrl.py"))["main"]
@@ -117,6 +120,7 @@ def test_example_of_purejaxrl_trains():
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("quick_compilation")
 def test_example_of_evosax_searches(need):
     need("evosax")
     names = runpy.run_path(str(Path(__file__).parents[1] / "examples" / "evosax_search.py"))

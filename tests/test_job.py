@@ -34,15 +34,16 @@ from bounce_mjx.runs.folders import (
     best_checkpoint,
     find_checkpoint,
     latest_checkpoint,
-    lock_run,
-    run_or_newest,
+    place_or_newest,
     stored_checkpoints,
 )
 from bounce_mjx.runs.layers import read_layers
 from bounce_mjx.runs.start import Choice
+from bounce_mjx.runs.storage import lock_run
 from bounce_mjx.training import hosts, job, saving
 from bounce_mjx.training.events import Event
 from bounce_mjx.training.faults import first_block_fault
+from bounce_mjx.training.run import Run
 from bounce_mjx.training.trainer import Snapshot
 from tiny_runs import contents
 
@@ -299,6 +300,8 @@ def test_a_history_of_checkpoints_stays_where_it_is_asked_for(tmp_path: Path) ->
     run = train(tmp_path / "all", returns, keep_checkpoints="all")
     assert stored(run) == [1, 2, 3, 4]
     assert iterations_of(find_checkpoint(run / f"checkpoints/{3 * BLOCK}")) == 3
+    for place, mean_return in ((run, 9.0), (run / f"checkpoints/{3 * BLOCK}", 5.0)):
+        assert Run(place).results.details["mean_return"] == mean_return
     third = run / f"checkpoints/{2 * BLOCK}"
     returns = {1: 9.0, 3: 6.0, 4: 7.0, 5: 8.0}
     train(tmp_path / "all", returns, third, keep_checkpoints="all")
@@ -310,10 +313,16 @@ def test_a_history_of_checkpoints_stays_where_it_is_asked_for(tmp_path: Path) ->
 
 
 def test_the_state_of_all_seeds_is_no_policy_and_no_damage(tmp_path: Path) -> None:
-    run = train(tmp_path, RETURNS, num_seeds=SEEDS)
-    state = find_checkpoint(run / "checkpoints")
+    """Of no command: a warm start, a plot and a report find it as an evaluation does."""
+    run = train(tmp_path / "evaluated", RETURNS, num_seeds=SEEDS)
     with pytest.raises(UserError, match="holds the state of all 3 seeds, with which .*; give"):
-        read_policy(state, load_run_config(run))
+        find_checkpoint(run / "checkpoints")
+    signalled = before(2, lambda: os.kill(os.getpid(), signal.SIGTERM))
+    with pytest.raises(job.TrainingStopped):
+        train(tmp_path, RETURNS, trainer=signalled, num_seeds=SEEDS, eval_every=4 * BLOCK)
+    (run,) = tmp_path.glob("2*")
+    with pytest.raises(UserError, match="no policy is evaluated yet; resume it: bounce-mjx train"):
+        find_checkpoint(run)
 
 
 @pytest.mark.parametrize(("given", "trained"), [(170, 192), (80, 64)])
@@ -490,6 +499,22 @@ def test_a_signal_saves_and_says_how_to_resume(tmp_path: Path, number: signal.Si
     assert latest_checkpoint(run).steps == 2 * BLOCK
     train(tmp_path, RETURNS, run)
     assert evaluated_steps(run) == [64, 128, 192, 256]
+
+
+def test_a_signal_during_the_last_save_is_not_lost(tmp_path: Path, monkeypatch) -> None:
+    start = saving.Saver.start
+
+    def interrupted(self, snapshot, steps, about):
+        # That of the final results has no state.
+        if snapshot is None:
+            os.kill(os.getpid(), signal.SIGTERM)
+        start(self, snapshot, steps, about)
+
+    monkeypatch.setattr(saving.Saver, "start", interrupted)
+    with pytest.raises(job.TrainingStopped, match="after 128 steps, after the final evaluation"):
+        train(tmp_path, {1: 5.0, 2: 9.0})
+    (run,) = tmp_path.iterdir()
+    assert results_of(run)["fresh_resets"]
 
 
 def test_a_signal_during_the_compilation_leaves_nothing(tmp_path: Path) -> None:
@@ -854,7 +879,7 @@ def test_each_seed_has_a_run_of_its_own_and_the_best_one_is_found(tmp_path: Path
         assert evaluated_steps(folder) == [64, 128, 192]
         assert results_of(folder)["best_steps"] == BLOCK * best
         assert iterations_of(best_checkpoint(folder)) == best
-    assert find_checkpoint(run_or_newest(None, tmp_path)) == best_checkpoint(folders[1])
+    assert find_checkpoint(place_or_newest(None, tmp_path)) == best_checkpoint(folders[1])
     # Resumed, each knows its best one.
     train(tmp_path, returns | {4: (2.5, 9.0, 1.0)}, run, num_seeds=SEEDS)
     assert [results_of(folder)["best_steps"] for folder in folders] == [128, 256, 192]

@@ -292,6 +292,7 @@ def test_no_client_can_end_the_server_or_leave_a_range(page, capfd) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("quick_compilation")
 def test_the_page_shows_the_goals_of_any_task(monkeypatch) -> None:
     env = Env(LeanConfig(physics="fused"))
     leaning = Simulation(env, make_zero_controller(env), 2, seed=0)

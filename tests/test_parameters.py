@@ -20,6 +20,7 @@ from against_c import (
     c_steps,
     edited,
     fused_steps,
+    jit_mjx,
     num_contacts,
     push_by_air,
     random_states,
@@ -71,7 +72,6 @@ def test_one_given_number_leaves_the_others_to_the_model(mj_model, field, float6
 
 
 @pytest.mark.slow
-@pytest.mark.separate_loops
 def test_mjx_carries_worlds(mj_model, float64):
     """Free run against C over control steps, in random worlds with friction, air and
     servos at their limits."""
@@ -91,7 +91,7 @@ def test_mjx_carries_worlds(mj_model, float64):
         data[i][1].qpos[:], data[i][1].qvel[:] = (x[i] for x in state)
     engine = make_engine(mj_model, "mjx")
     control = partial(Control, air_drag=air_drag)
-    step = jax.jit(jax.vmap(lambda p, s, u: engine.step(p, s, control(u), num_substeps)))
+    step = jit_mjx(jax.vmap(lambda p, s, u: engine.step(p, s, control(u), num_substeps)))
     contacts, flight, touched = 0, [], set()
     for i in range(6):
         ctrl = np.asarray(state.qpos[:, :6]) + 0.02 * (-1.0) ** i

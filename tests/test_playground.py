@@ -1,7 +1,6 @@
 """MuJoCo Playground's registry, wrappers, renderer and training program work on the tasks."""
 
 import json
-import os
 import runpy
 import subprocess
 import sys
@@ -30,7 +29,7 @@ ENV_NAME = "BounceBall"
 
 
 @pytest.mark.slow
-def test_playground_loads_the_environment_without_a_network(monkeypatch):
+def test_playground_loads_the_environment_without_a_network(monkeypatch, quick_compilation):
     # Playground fetches its own robots before it loads one of its environments.
     monkeypatch.setattr(mjx_env, "ensure_menagerie_exists", lambda: pytest.fail("fetched"))
     assert ENV_NAME in registry.ALL_ENVS and ENV_NAME in manipulation.ALL_ENVS
@@ -86,7 +85,7 @@ def test_playground_has_the_other_tasks(task):
 
 
 @pytest.mark.slow
-def test_randomization_by_playground_acts_on_the_physics():
+def test_randomization_by_playground_acts_on_the_physics(quick_compilation):
     """Worlds of Playground's own randomiser: the ball falls with the gravity of its world."""
     env = registry.load(ENV_NAME)
     keys = jax.random.split(jax.random.PRNGKey(0), 3)
@@ -143,7 +142,7 @@ def test_example_films_randomised_worlds(tmp_path, opengl, need):
 
 
 @pytest.mark.slow
-def test_playgrounds_program_runs_to_its_end(tmp_path, opengl, need):
+def test_playgrounds_program_runs_to_its_end(tmp_path, opengl, need, quick_compilation):
     """`train-jax-ppo` trains in randomised worlds, saves a checkpoint and films the policy."""
     need("mediapy")
     flags = (
@@ -153,9 +152,7 @@ def test_playgrounds_program_runs_to_its_end(tmp_path, opengl, need):
         f"--domain_randomization=True --logdir={tmp_path}"
     )
     command = [sys.executable, "-m", "bounce_mjx.adapters.playground", *flags.split()]
-    # It computes little.
-    environment = os.environ | {"JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}
-    done = subprocess.run(command, capture_output=True, text=True, env=environment)
+    done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-2000:]
     (video,) = tmp_path.glob("BounceBall-*/rollout0.mp4")
     assert video.stat().st_size > 1000

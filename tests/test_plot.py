@@ -48,7 +48,7 @@ from bounce_mjx.reports.curves import (
 from bounce_mjx.reports.figures import curves_figure, rewards_figure
 from bounce_mjx.reports.tables import result_cells, results_table, unsolved_line
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.runs.folders import save_config
+from bounce_mjx.runs.creation import save_config
 from bounce_mjx.runs.layers import read_preset
 from bounce_mjx.runs.progress import load_results
 from bounce_mjx.task import Curve, term_names

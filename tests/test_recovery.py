@@ -258,7 +258,7 @@ print("counts:", *(events.count("/jax/compilation_cache/" + name) for name in na
 
 @pytest.mark.slow
 def test_a_second_start_compiles_nothing_and_trains_the_same(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, quick_compilation: None
 ) -> None:
     """The process of the first one gets a signal, and ends with 0; what it saves and says is in
     `test_job.py`. The second one trains for as long undisturbed."""

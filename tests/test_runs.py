@@ -25,18 +25,17 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.results import Report, Result
 from bounce_mjx.resources import resource_path
 from bounce_mjx.robot.model import fingerprint, load_model
-from bounce_mjx.runs import folders
+from bounce_mjx.runs import creation
 from bounce_mjx.runs import presets as presets_module
 from bounce_mjx.runs.checkpoints import read_record
 from bounce_mjx.runs.config import TrainConfig, load_run_config
+from bounce_mjx.runs.creation import create_run, save_config
 from bounce_mjx.runs.folders import (
     best_checkpoint,
     choose_checkpoint,
-    create_run,
     find_checkpoint,
     latest_checkpoint,
-    run_or_newest,
-    save_config,
+    place_or_newest,
 )
 from bounce_mjx.runs.layers import read_preset
 from bounce_mjx.runs.presets import preset_files
@@ -118,11 +117,12 @@ def test_the_arm_of_the_newest_run_is_named(runs: Path, capsys) -> None:
 
 def test_latest_is_a_name_for_every_command(runs: Path, monkeypatch) -> None:
     monkeypatch.chdir(runs)
-    assert run_or_newest(Path("latest"), runs) == run_or_newest(None, runs) == runs / "2026-01-02"
+    for word in (Path("latest"), None):
+        assert place_or_newest(word, runs) == runs / "2026-01-02"
     command = settings_of(["latest", "--log-dir", str(runs)])
-    assert command.layers.start.run == runs / "2026-01-02"
+    assert command.layers.start.place == runs / "2026-01-02"
     (runs / "latest").mkdir()
-    assert run_or_newest(Path("latest"), runs) == Path("latest")
+    assert place_or_newest(Path("latest"), runs) == Path("latest")
 
 
 def test_the_newest_run_is_not_the_greatest_name(tmp_path: Path) -> None:
@@ -133,8 +133,8 @@ def test_the_newest_run_is_not_the_greatest_name(tmp_path: Path) -> None:
         (tmp_path / name / "checkpoints/64").mkdir(parents=True)
         save_config(tmp_path / name, TrainConfig())
     while names:
-        assert run_or_newest(None, tmp_path).name == names.pop()
-        shutil.rmtree(run_or_newest(None, tmp_path))
+        assert place_or_newest(None, tmp_path).name == names.pop()
+        shutil.rmtree(place_or_newest(None, tmp_path))
 
 
 def test_a_run_is_opened_by_its_path_and_reads_its_policy_once(trained: Path, monkeypatch) -> None:
@@ -148,6 +148,11 @@ def test_a_run_is_opened_by_its_path_and_reads_its_policy_once(trained: Path, mo
     assert run.folder == trained and run.results == load_results(trained).best
     assert run.checkpoint == find_checkpoint(str(trained)) == find_checkpoint(trained)
     assert actions[0].shape == (6,) and np.array_equal(*actions) and len(reads) == 1
+    checkpoint = Run(run.checkpoint.folder)
+    assert (checkpoint.config, checkpoint.checkpoint) == (run.config, run.checkpoint)
+    for attribute in ("config", "checkpoint", "policy"):
+        with pytest.raises(UserError, match="is a folder of runs; give one of them, such as"):
+            getattr(Run(trained.parent), attribute)
 
 
 def counted(function: Callable, calls: list) -> Callable:
@@ -346,8 +351,9 @@ def test_files_of_the_user_lie_on_each_other(presets: Path) -> None:
         assert config.ppo.num_envs == read_preset(None).ppo.num_envs
         files = train_command.read_command(flags.split()).flags.config
         cpu, named, given = preset_files(files, config.task)
-        assert (cpu, named) == (resource_path("configs/cpu.yaml"), None)
-        assert " ".join(map(str, given)) == flags.replace("--config=", "").replace("--config ", "")
+        assert [file.path for file in cpu] == [resource_path("configs/cpu.yaml")] and not named
+        words = flags.replace("--config=", "").replace("--config ", "")
+        assert " ".join(str(file.path) for file in given) == words
     (presets / "more.yaml").write_text("base: randomized")
     with pytest.raises(UserError, match="more.yaml lies on my.yaml, so its base is not used"):
         read_preset([Path("my.yaml"), Path("more.yaml")])
@@ -355,7 +361,7 @@ def test_files_of_the_user_lie_on_each_other(presets: Path) -> None:
 
 def test_a_run_that_cannot_be_written_leaves_no_folder(tmp_path: Path, monkeypatch) -> None:
     full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-    monkeypatch.setattr(folders, "write_atomically", unittest.mock.Mock(side_effect=full))
+    monkeypatch.setattr(creation, "write_atomically", unittest.mock.Mock(side_effect=full))
     with pytest.raises(UserError, match="cannot be written .No space left on device"):
         create_run(TrainConfig(log_dir=tmp_path))
     assert not list(tmp_path.iterdir())

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from jax.experimental import multihost_utils
 
+import tiny_runs
 from bounce_mjx.commands import train as train_command
 from bounce_mjx.errors import UserError
 from bounce_mjx.learning import ppo
@@ -31,7 +32,8 @@ SEEDS = 3
 
 
 def train(log_dir: Path, *flags: str) -> Path:
-    train_command.main([*SHARED, "--log-dir", str(log_dir), *flags])
+    with tiny_runs.quick_compilation():
+        train_command.main([*SHARED, "--log-dir", str(log_dir), *flags])
     (run,) = log_dir.iterdir()
     return run
 
@@ -93,7 +95,7 @@ def test_each_of_several_seeds_trains_as_if_alone(seeds: Path, alone: Path, tmp_
 
 
 @pytest.mark.slow
-def test_several_seeds_resume_exactly(seeds: Path, tmp_path: Path):
+def test_several_seeds_resume_exactly(seeds: Path, tmp_path: Path, quick_compilation: None):
     run = train(tmp_path / "half", "--num-seeds", str(SEEDS), "--total-steps", str(STEPS))
     train_command.main([str(run), "--total-steps", str(2 * STEPS), "--no-report"])
     ours, theirs = (arrays(latest_checkpoint(r)) for r in (run, seeds))
@@ -107,7 +109,9 @@ def test_several_seeds_resume_exactly(seeds: Path, tmp_path: Path):
 
 
 @pytest.mark.slow
-def test_eight_devices_train_as_one(alone: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_eight_devices_train_as_one(
+    alone: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, quick_compilation: None
+):
     """And one device resumes what eight began."""
     monkeypatch.setenv("XLA_FLAGS", "--xla_force_host_platform_device_count=8")
     flags = [*SHARED, "--num-devices", "8", "--total-steps", "384", "--log-dir", tmp_path / "runs"]
@@ -153,7 +157,9 @@ def free_port() -> int:
 
 
 @pytest.mark.slow
-def test_two_processes_train_as_one(alone: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_two_processes_train_as_one(
+    alone: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, quick_compilation: None
+):
     monkeypatch.setenv("XLA_FLAGS", "--xla_force_host_platform_device_count=2")
     flags = [*SHARED, "--log-dir", tmp_path / "runs", "--num-processes", "2"]
     flags += ["--coordinator-address", f"127.0.0.1:{free_port()}"]

@@ -21,7 +21,8 @@ from bounce_mjx.config.user_code import import_code
 from bounce_mjx.errors import UserError
 from bounce_mjx.runs import presets
 from bounce_mjx.runs.config import TrainConfig, load_run_config
-from bounce_mjx.runs.folders import create_run, find_checkpoint
+from bounce_mjx.runs.creation import create_run
+from bounce_mjx.runs.folders import find_checkpoint
 from bounce_mjx.runs.layers import read_layers, read_preset
 from bounce_mjx.runs.start import Choice
 from bounce_mjx.training import job
@@ -236,9 +237,11 @@ def test_a_whole_config_stands_alone_below_what_python_says() -> None:
         ({"task": "catch"}, "task is the first argument: train('catch', ...)"),
         ({"resume": "runs/x"}, "resume is the first argument: train('runs/x', ...)"),
         ({"num_envs": 0}, "train: ppo.num_envs is 0, but must be greater than or equal to 1"),
+        ({"start": whole}, "the first argument is a config; give it by name: train(config=...)"),
+        ({"config": {"seed": 1}}, "config is a mapping; give its keys as arguments: train(..., **"),
     ):
         with pytest.raises(UserError) as caught:
-            bounce_mjx.train(config=whole, quiet=True, **arguments)
+            bounce_mjx.train(**{"config": whole, "quiet": True} | arguments)
         assert sentence in str(caught.value)
 
 
@@ -457,7 +460,7 @@ def test_what_a_file_cannot_say_is_told(folder: Path, refused) -> None:
     line = "train --config my.yaml --print-config"
     refused(line, "my.yaml: robot is no setting; leave it out, and give --robot or train(robot=")
     (folder / "my.yaml").write_text("task: null")
-    refused(line, "my.yaml: task is None, but must be a name")
+    refused(line, "my.yaml: task is null, but must be a name")
     (folder / "run").mkdir()
     refused("train run --log-dir typo", "--log-dir is where the newest run is looked for")
 

@@ -179,6 +179,7 @@ def test_another_model_has_no_slider_for_a_restitution() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("quick_compilation")
 def test_a_moved_slider_changes_the_world_at_once(monkeypatch) -> None:
     """Of the nominal policy, in worlds whose ball mass is drawn."""
     checkpoint = find_checkpoint("pretrained")

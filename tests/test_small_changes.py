@@ -18,7 +18,7 @@ SHORT |= {"eval_episodes": 4, "screening_episodes": 0, "episode_seconds": 0.5, "
 
 
 @pytest.mark.slow
-def test_each_small_change_has_its_effect(tmp_path: Path, monkeypatch) -> None:
+def test_each_small_change_has_its_effect(tmp_path: Path, monkeypatch, quick_compilation) -> None:
     blocks = PAGE.read_text(encoding="utf-8").split("```python\n")[1:]
     code = "\n\n".join(block.split("```")[0] for block in blocks)
     (tmp_path / "small.py").write_text(code.replace("episodes=64", "episodes=4"))

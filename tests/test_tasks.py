@@ -32,7 +32,8 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.learning.metrics import rollout_metrics, step_metrics
 from bounce_mjx.runs import checkpoints
 from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig, load_run_config
-from bounce_mjx.runs.folders import create_run, find_checkpoint
+from bounce_mjx.runs.creation import create_run
+from bounce_mjx.runs.folders import find_checkpoint
 from bounce_mjx.runs.layers import read_preset
 from bounce_mjx.runs.storage import seal
 from bounce_mjx.task import paths, registry
@@ -53,7 +54,10 @@ RESULT = r"rests +episodes"
 
 @pytest.mark.slow
 def test_a_task_without_events_goes_through_every_command(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    quick_compilation: None,
 ) -> None:
     """It has no goal, event, curve, marker or plot."""
     monkeypatch.chdir(tmp_path)

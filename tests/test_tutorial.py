@@ -93,11 +93,11 @@ def copy_of_run(runs: Path, printed: str) -> None:
 
 
 @pytest.mark.slow
-def test_the_commands_of_the_tutorial_run(tmp_path: Path, monkeypatch, capsys, request) -> None:
+def test_the_commands_of_the_tutorial_run(
+    tmp_path: Path, monkeypatch, capsys, quick_compilation
+) -> None:
     """From top to bottom, with a small training, which no result passes. LLVM takes most of the
     time, and its optimisations change nothing that this test sees."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    request.addfinalizer(lambda: jax.config.update("jax_disable_most_optimizations", False))
     monkeypatch.chdir(tmp_path)
     lines = re.findall(r"^ {4}bounce-mjx (.+)$", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
     ran = []

@@ -20,6 +20,7 @@ from bounce_mjx.commands import view
 
 pytestmark = [
     pytest.mark.slow,
+    pytest.mark.usefixtures("quick_compilation"),
     pytest.mark.skipif(shutil.which("chromium") is None, reason="Chromium is not installed"),
 ]
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import yaml
 
+import tiny_runs
 from bounce_mjx.commands import train as train_command
 from bounce_mjx.config.user_code import import_code
 from bounce_mjx.env.env import Env
@@ -24,8 +25,11 @@ from bounce_mjx.runs.checkpoints import (
     read_warm_start,
     save_checkpoint,
 )
-from bounce_mjx.runs.config import load_run_config
-from bounce_mjx.runs.folders import best_checkpoint, create_run, find_checkpoint
+from bounce_mjx.runs.config import TrainConfig, load_run_config
+from bounce_mjx.runs.creation import create_run
+from bounce_mjx.runs.folders import best_checkpoint, find_checkpoint
+from bounce_mjx.runs.layers import layers_on
+from bounce_mjx.runs.start import FileFlags, StartFlags, find_start
 from tiny_runs import STEPS, TINY, settings_of
 
 CRITIC = {"n_bounces", "world/restitution", "world/air_drag"}
@@ -41,7 +45,8 @@ def first(tmp_path_factory: pytest.TempPathFactory) -> Path:
     log_dir = tmp_path_factory.mktemp("first") / "runs"
     flags = ["--critic-metrics", "n_bounces", "world/*", "--total-steps", str(STEPS)]
     terms = "--randomization.restitution 0.7 0.9 --randomization.air-drag 0.0 0.2".split()
-    train_command.main([*TINY, *flags, *terms, "--no-report", "--log-dir", str(log_dir)])
+    with tiny_runs.quick_compilation():
+        train_command.main([*TINY, *flags, *terms, "--no-report", "--log-dir", str(log_dir)])
     (run,) = log_dir.iterdir()
     return run
 
@@ -86,7 +91,9 @@ def test_the_value_network_keeps_the_terms_of_both_worlds_and_is_blind_to_new_on
 
 
 @pytest.mark.slow
-def test_a_training_starts_with_the_policy_of_the_run(first: Path, tmp_path: Path) -> None:
+def test_a_training_starts_with_the_policy_of_the_run(
+    first: Path, tmp_path: Path, quick_compilation: None
+) -> None:
     """Its first evaluation, before any step, is that of the run's policy."""
     args = [*TINY[: TINY.index("--hidden-layers")], *TINY[TINY.index("--block-steps") :]]
     args = [x for x in args if x not in ("--episode-seconds", "0.5")]
@@ -154,7 +161,13 @@ def test_the_latest_run_is_that_beside_the_new_one_or_else_of_the_task(
     config = settings_of("--warm-start latest --log-dir new".split()).config
     assert config.warm_start == best_checkpoint(run).folder
     assert config.log_dir == Path("new")
-    # But where the new one's folder has runs, it is one of those, as with --resume.
+    # But where the new one's folder has runs, it is one of those, as for a run that is resumed.
     other = shutil.copytree(run, tmp_path / "mine/2025-01-01_00-00-00")
     config = settings_of("--warm-start latest --log-dir mine".split()).config
     assert config.warm_start == best_checkpoint(other).folder
+    # A whole config may name it too.
+    whole = TrainConfig(warm_start=Path("latest"), env=config.env, ppo=config.ppo)
+    start = find_start(None, StartFlags(log_dir=Path("mine")), whole)
+    config = layers_on(start, FileFlags()).config()
+    assert config.warm_start == best_checkpoint(other).folder
+    assert config.sources["warm_start"] == "config"

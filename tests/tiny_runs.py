@@ -13,6 +13,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import orbax.checkpoint as ocp
+import pytest
 
 from bounce_mjx.commands import train as train_command
 from bounce_mjx.runs.folders import Checkpoint
@@ -30,6 +31,23 @@ TINY = (
 TIMEOUT = 300.0
 
 
+@contextlib.contextmanager
+def quick_compilation() -> Iterator[None]:
+    """Within it, and in the processes that are started in it, XLA compiles quickly and optimises
+    little: for programs of a few steps, most of whose time is compilation.
+
+    A program is another one with than without it, and rounds otherwise.
+    """
+    before = jax.config.read("jax_disable_most_optimizations")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
+        jax.config.update("jax_disable_most_optimizations", True)
+        try:
+            yield
+        finally:
+            jax.config.update("jax_disable_most_optimizations", before)
+
+
 def settings_of(words: Sequence[str], machine: Path | None = None) -> train_command.Settings:
     """What a command line of `bounce-mjx train` trains, by default on this machine."""
     return train_command.read_command(words).settings(machine)
@@ -40,6 +58,7 @@ def shared_run(name: str = "straight", *flags: str) -> Path:
 
     The first test that asks for a name trains the run, and another process waits for it.
     """
+    assert not jax.config.read("jax_disable_most_optimizations"), "all tests share it"
     folder = Path(os.environ["BOUNCE_MJX_TESTS_RUNS"]) / name
     folder.mkdir(exist_ok=True)
     with (folder / "lock").open("w") as lock:

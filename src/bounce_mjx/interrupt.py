@@ -47,7 +47,9 @@ def _handle(number: int, handler: Any) -> Any:
 
 class StopRequest:
     """While entered in the main thread, the first signal only sets `requested`; a later SIGINT or
-    SIGTERM goes to the handler before, such as a notebook's, and then ends the process at once."""
+    SIGTERM does what it did before. By the default action, which commands have (`end_on_ctrl_c`),
+    it ends the process at once. Python's own handler, also that of a notebook, raises a
+    KeyboardInterrupt; after one that returns, the process ends too."""
 
     def __init__(self) -> None:
         self._requested_at: float | None = None

@@ -6,13 +6,15 @@ from pathlib import Path
 VERSION = "0.1.0"
 
 PRETRAINED = "pretrained"
+"""The policy of the default task, bounce, and the folder with all policies."""
+ROBUST_POLICIES = ("robust", "robust_small")
+"""Policies of the default task for many worlds."""
 TASK_POLICIES = ("balance", "catch", "juggle", "track")
 """Tasks with a policy of their name, in addition to the default task's, `PRETRAINED`."""
 ARM_POLICIES = ("ur5e", "panda", "iiwa")
-"""Arms of configs/robots/ with a policy of their name."""
+"""Arms of configs/robots/ with a policy of their name, of the default task."""
 POLICIES = {PRETRAINED: PRETRAINED} | {
-    name: f"{PRETRAINED}/{name}"
-    for name in ("robust", "robust_small", *TASK_POLICIES, *ARM_POLICIES)
+    name: f"{PRETRAINED}/{name}" for name in (*ROBUST_POLICIES, *TASK_POLICIES, *ARM_POLICIES)
 }
 """The policies that come with the package, and their folders."""
 

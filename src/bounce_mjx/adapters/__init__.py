@@ -1,5 +1,5 @@
-"""The environment with the interfaces of other libraries. Each wraps one `Env`, its `core`, which
-`bounce_mjx.environment` makes; one around another class has it there:
+"""The environment with the interfaces of other libraries. A class wraps an `Env`, which
+`bounce_mjx.environment` makes, and has it as `core`; or it wraps another class of these, as said:
 
 | library | class | in |
 |---|---|---|

@@ -42,8 +42,7 @@ def describe() -> Iterator[tuple[str, str]]:
     chosen = {name: value for name, value in os.environ.items() if name.startswith(_VARIABLES)}
     yield "variables", ", ".join(f"{n}={v}" for n, v in sorted(chosen.items())) or "none"
     yield "processors", f"{os.cpu_count()}"
-    devices = lambda: (f"{x.device_kind} ({x})" for x in import_module("jax").devices())  # noqa: E731
-    yield "devices", _try(lambda: ", ".join(devices()))
+    yield "devices", _try(_devices)
     yield "cache", _try(_cache)
     viewers = "bounce_mjx.viewers"
     yield "pictures", _try(lambda: import_module(f"{viewers}.offscreen").choose_backend())
@@ -99,6 +98,12 @@ def _try(describe: Callable[[], str]) -> str:
         return describe()
     except Exception as error:
         return f"none ({reason_of(error)})"
+
+
+def _devices() -> str:
+    import jax
+
+    return ", ".join(f"{device.device_kind} ({device})" for device in jax.devices())
 
 
 def _cache() -> str:

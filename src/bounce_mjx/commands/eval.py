@@ -3,7 +3,9 @@
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
+
+from rich.console import Console
 
 from bounce_mjx.commands.goals import parse_with_goals
 from bounce_mjx.commands.which_policy import (
@@ -22,6 +24,10 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation import config as evaluation
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import RandomizationConfig
+
+if TYPE_CHECKING:
+    from bounce_mjx.evaluation.failures import Failure
+    from bounce_mjx.evaluation.statistics import Statistics
 
 # Flags that `play` lacks, which the command of a film leaves out; one that ends with = has a value.
 _NOT_OF_PLAY = ("--failures", "--contacts", "--limits", "--json=", "--physics=")
@@ -74,15 +80,12 @@ def main(args: Sequence[str]) -> None:
     """Runs the command line; exits with 0 if no result fails, 1 if one does, 2 on a mistake."""
     command, given_goals = parse_with_goals(EvalCommand, args, prog="bounce-mjx eval")
     from bounce_mjx.evaluation.contacts import arm_contacts, describe_contacts
-    from bounce_mjx.evaluation.failures import associations, failures_of
+    from bounce_mjx.evaluation.failures import failures_of
     from bounce_mjx.evaluation.limits import describe_limits, limit_shares
     from bounce_mjx.evaluation.policy_evaluation import evaluate_policy
     from bounce_mjx.evaluation.statistics import RECORDED_EPISODES
-    from bounce_mjx.reports.failures import association_lines, failures_figure, failures_table
-    from bounce_mjx.reports.figures import image
     from bounce_mjx.reports.tables import details_line, results_table
     from bounce_mjx.runs.checkpoints import read_actor
-    from bounce_mjx.runs.folders import is_users_run
     from bounce_mjx.runs.storage import check_output, to_json, write_output
     from bounce_mjx.training.setup import set_up_jax
 
@@ -97,8 +100,6 @@ def main(args: Sequence[str]) -> None:
     goals = given_goals.checked(config.env)
     set_up_jax(evaluation.on_engine(config.env, command.physics))
     checkpoint, policy, actor = read_actor(checkpoint, config)
-    # In the user's run; for a policy of the package and the mirror law, here.
-    picture = (checkpoint.run if is_users_run(checkpoint.run) else Path()) / "failures.png"
     steps = f" ({checkpoint.steps:,} steps)" if checkpoint.steps else ""
     print(f"checkpoint: {checkpoint.folder}{steps}")
     options = evaluation.EvaluationOptions(
@@ -150,24 +151,38 @@ def main(args: Sequence[str]) -> None:
             **findings,
         }
         write_output(command.json_file, to_json(content))
-    if command.failures:
-        terms = associations(evaluated.statistics, failures)
-        if failures:
-            console.print(failures_table(failures, terms, command.episodes))
-            print(*association_lines(terms), sep="\n")
-        else:
-            print(f"no episode of {command.episodes:,} failed")
-        if failures and terms:
-            write_output(picture, image(failures_figure(terms), "png"))
-            print(f"picture: {picture}")
+    if failures:
+        _show_failures(failures, evaluated.statistics, checkpoint.run, command.episodes, console)
         # A film is on the config's engine.
-        if failures and command.physics == "config":
+        if command.physics == "config":
             first_to_end = min(failures, key=lambda failure: failure.seconds)
-            shown = film_command(
-                args,
-                _NOT_OF_PLAY,
-                *("--episode", str(first_to_end.episode)),
-                imports=import_flags(config.env.task),
-            )
-            print(f"film of one: {shown}")
+            film = "--episode", str(first_to_end.episode)
+            imports = import_flags(config.env.task)
+            print(f"film of one: {film_command(args, _NOT_OF_PLAY, *film, imports=imports)}")
+    elif command.failures:
+        print(f"no episode of {command.episodes:,} failed")
     sys.exit(0 if report.passed else 1)
+
+
+def _show_failures(
+    failures: "list[Failure]",
+    statistics: "Statistics",
+    run: Path,
+    episodes: int,
+    console: Console,
+) -> None:
+    """Prints the failed episodes and the terms of the world that go with failure, and draws these,
+    if any, in the user's run or, for a policy of the package and the mirror law, here."""
+    from bounce_mjx.evaluation.failures import associations
+    from bounce_mjx.reports.failures import association_lines, failures_figure, failures_table
+    from bounce_mjx.reports.figures import image
+    from bounce_mjx.runs.folders import is_users_run
+    from bounce_mjx.runs.storage import write_output
+
+    terms = associations(statistics, failures)
+    console.print(failures_table(failures, terms, episodes))
+    print(*association_lines(terms), sep="\n")
+    if terms:
+        picture = (run if is_users_run(run) else Path()) / "failures.png"
+        write_output(picture, image(failures_figure(terms), "png"))
+        print(f"picture: {picture}")

@@ -63,8 +63,9 @@ def main(args: Sequence[str]) -> None:
 
     known = None if command.check is None else read_world(command.check)
     page = command.out.with_suffix(".html")
-    for path in (command.out, page) if known is None else ():
-        check_output(path, "--out")
+    if known is None:
+        check_output(command.out, "--out")
+        check_output(page, "--out")
     config = read_preset(Path("default"), command.robot).env
     if known is not None:
         # Its ranges are of this robot's joints.

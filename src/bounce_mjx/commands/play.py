@@ -29,7 +29,10 @@ from bounce_mjx.viewers.options import MAX_ENVS, ViewerOptions
 from bounce_mjx.world.randomization import RandomizationConfig
 
 if TYPE_CHECKING:
+    from bounce_mjx.env.env import Env
     from bounce_mjx.evaluation.policy_evaluation import InEvaluation
+    from bounce_mjx.learning.policy import Actor
+    from bounce_mjx.viewers.simulation import Controller
 
 
 class PlayCommand(WhichPolicy):
@@ -81,7 +84,6 @@ def main(args: Sequence[str]) -> None:
     from bounce_mjx.training.setup import set_up_jax
     from bounce_mjx.viewers.film import film_player
     from bounce_mjx.viewers.show import Shown, show
-    from bounce_mjx.viewers.simulation import make_policy_controller
 
     chosen = command.choose(*command.checkpoints or (None,), robot=command.robot)
     configs = [command.config_of(checkpoint, command.robot, world) for checkpoint in chosen]
@@ -96,14 +98,20 @@ def main(args: Sequence[str]) -> None:
         title = checkpoint.run.name
         if checkpoint is not MIRROR_LAW:
             title += f", {count_text(checkpoint.steps)} steps"
-        make_controller = lambda env, actor=actor: make_policy_controller(actor(env))  # noqa: E731
         film = None
         if command.episode is not None:
             title += f", episode {command.episode}"
             find = _episode_finder(command, config, goals)
             film = film_player(find, actor, policy, _evaluation_seed(command))
-        shown.append(Shown(config.env, make_controller, title, policy, film))
+        shown.append(Shown(config.env, partial(_controller, actor), title, policy, film))
     show(shown, command.viewing, goals=goals, console=stdout())
+
+
+def _controller(make_actor: "Callable[[Env], Actor]", env: "Env") -> "Controller":
+    """What moves the simulated arm of an environment."""
+    from bounce_mjx.viewers.simulation import make_policy_controller
+
+    return make_policy_controller(make_actor(env))
 
 
 def _evaluation_seed(command: PlayCommand) -> int:

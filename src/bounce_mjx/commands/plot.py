@@ -30,9 +30,10 @@ def main(args: Sequence[str]) -> None:
     command = parse(PlotCommand, args, prog="bounce-mjx plot")
     from bounce_mjx.runs.folders import find_checkpoint, runs_of_seeds
 
-    runs = command.choose_runs(*command.runs or (None,))
-    folders = [folder for run in runs for folder in runs_of_seeds(run)]
-    checkpoints = [find_checkpoint(folder) for folder in folders]
+    places = command.choose_places(*command.runs or (None,))
+    # With several seeds, each has its own curves.
+    each = [folder for place in places for folder in runs_of_seeds(place)]
+    checkpoints = [find_checkpoint(place) for place in each]
     configs = [load_run_config(checkpoint.run) for checkpoint in checkpoints]
 
     # These take seconds, which a mistake in the words above should not.

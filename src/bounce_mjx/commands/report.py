@@ -22,11 +22,13 @@ def main(args: Sequence[str]) -> None:
     command = parse(ReportCommand, args, prog="bounce-mjx report")
     from bounce_mjx.runs.folders import find_checkpoint
 
-    (run,) = command.choose_runs(command.run)
-    checkpoint = find_checkpoint(run)
+    (place,) = command.choose_places(command.run)
+    checkpoint = find_checkpoint(place)
     # With several seeds, that of the best one lies below the run.
-    if checkpoint.run.absolute() in run.absolute().parents:
-        raise UserError(f"a report is of a run's best checkpoint; give {checkpoint.run}, not {run}")
+    if checkpoint.run.absolute() in place.absolute().parents:
+        raise UserError(
+            f"a report is of a run's best checkpoint; give {checkpoint.run}, not {place}"
+        )
     config = load_run_config(checkpoint.run)
 
     # These take seconds, which a mistake in the words above should not.

@@ -15,7 +15,7 @@ from pydantic.fields import FieldInfo
 from bounce_mjx.config.command_line import flag_names, parse, read_flags, stdout, typed
 from bounce_mjx.config.files import dump_with_sources, flat
 from bounce_mjx.config.settings import Count, NonNegativeInt, fields_in
-from bounce_mjx.errors import UserError, exit_on_user_error
+from bounce_mjx.errors import UserError
 from bounce_mjx.interrupt import in_daemon_thread, leave
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.layers import Layers, layers_on
@@ -126,10 +126,12 @@ def read_command(args: Sequence[str]) -> TrainCommand:
         usual = layers_on(start, first, default_preset(has_plugin())).config()
         _print_help(fields, usual, is_short="--help-all" not in helps)
     given = read_flags(fields, words, prog=PROG, description=ABOUT, defaults={})
-    if given.get("word") != word:
+    late_word = given.get("word")
+    if late_word != word:
+        # Refuses what is none, such as a second value of a flag.
+        find_start(late_word, first)
         raise UserError(
-            f"{given['word']} is what the training begins with; give it first: {PROG} "
-            f"{given['word']} ..."
+            f"{late_word} is what the training begins with; give it first: {PROG} {late_word} ..."
         )
     flags = typed(TrainFlags, given, flag_names(fields), PROG)
     said = {key: value for key, value in given.items() if key in start.fields}
@@ -203,15 +205,18 @@ def train(command: TrainCommand, settings: Settings) -> None:
     from bounce_mjx.training.job import TrainingStopped, imports_of
     from bounce_mjx.training.run import run_training
 
-    # A second `exit_on_user_error`, within: a mistake becomes a status here, on which this process
-    # leaves without waiting for the others.
-    with hosts.leave_without_waiting(), exit_on_user_error():
+    with hosts.leave_on_user_error():
         if flags.on_several_hosts:
             # JAX must not be asked for its devices before.
-            numbers = flags.num_processes, flags.process_id, flags.host_timeout
-            hosts.join(flags.coordinator_address, *numbers)
+            hosts.join(
+                flags.coordinator_address,
+                flags.num_processes,
+                flags.process_id,
+                limit=flags.host_timeout,
+            )
         layers, config = _for_devices(command, settings)
-        console, callbacks = stdout(quiet=not hosts.is_leader()), []
+        console = stdout(quiet=not hosts.is_leader())
+        callbacks = []
         is_watched = flags.watch and hosts.is_leader()
         if is_watched:
             # Only a training run that is watched pays for this import.

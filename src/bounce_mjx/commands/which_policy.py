@@ -149,14 +149,14 @@ class WhichPolicy(StrictModel):
         folder = self.folder_for(*paths)
         return [self._choose(path, folder, robot) for path in paths]
 
-    def choose_runs(self, *paths: Path | None) -> list[Path]:
-        """The run of each path, with its log: `run_or_newest`.
+    def choose_places(self, *paths: Path | None) -> list[Path]:
+        """The place of each path, in a run with a log: `place_or_newest`.
 
         Raises:
           UserError: there is none, it is a policy of the package, which has no log, or --log-dir is
             given beside named ones.
         """
-        from bounce_mjx.runs.folders import run_or_newest
+        from bounce_mjx.runs.folders import place_or_newest
 
         folder = self.folder_for(*paths)
         for path in paths:
@@ -165,7 +165,7 @@ class WhichPolicy(StrictModel):
                     f"the policy {path} comes with the package, without the log of its training; "
                     "give a run's folder"
                 )
-        return [run_or_newest(path, folder) for path in paths]
+        return [place_or_newest(path, folder) for path in paths]
 
     def folder_for(self, *paths: Path | None) -> Path:
         """Where the newest run is looked for: `log_dir`, or the folder of the task's runs.
@@ -175,9 +175,9 @@ class WhichPolicy(StrictModel):
         """
         if self.log_dir is None:
             return runs_folder(find_task(self.task or DEFAULT))
-        from bounce_mjx.runs.folders import check_newest
+        from bounce_mjx.runs.folders import check_log_dir
 
-        check_newest(paths)
+        check_log_dir(paths)
         return self.log_dir
 
     @staticmethod

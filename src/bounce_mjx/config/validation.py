@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import pydantic
 from pydantic.fields import FieldInfo
 
-from bounce_mjx.config.settings import StrictModel, fields_in
+from bounce_mjx.config.settings import StrictModel, fields_in, types_in
 from bounce_mjx.errors import UserError, shorten
 
 ConfigT = TypeVar("ConfigT", bound=StrictModel)
@@ -68,7 +68,7 @@ def describe(
       group: dotted key, in `fields`, of what was validated.
     """
     first = error.errors()[0]
-    key = key_of(error, group)
+    key = _setting_of(key_of(error, group), fields)
     if first["type"] in ("extra_forbidden", "invalid_key"):
         return f"unknown key {shorten(key)}; {_advice_on(key, fields)}"
     if first["type"] == "value_error":
@@ -82,6 +82,11 @@ def describe(
         reason = "must be a path"
     if first["type"].startswith(("greater_than", "less_than")) and key in fields:
         reason += f" {unit_of(fields[key].description or '')}".rstrip()
+    for other in error.errors()[1:]:
+        # Each member of a union says what it accepts of the same value.
+        is_of_setting = _setting_of(".".join(_path(other, group)), fields) == key
+        if is_of_setting and _items(other) == _items(first):
+            reason += f", or {other['msg'].removeprefix('Input should ')}"
     given = shorten(str(first["input"]))
     return f"{flags.get(key, key)} is {given}, but {reason.replace('input should', 'must', 1)}"
 
@@ -131,6 +136,15 @@ def _advice_on(key: str, fields: Mapping[str, FieldInfo]) -> str:
     return f"known keys here are {', '.join(sorted(here))}"
 
 
+def _setting_of(key: str, fields: Mapping[str, FieldInfo]) -> str:
+    """The setting of a mistake's key, which may go on with the type of a union's member; of a
+    mapping such as `shares`, it goes on with a key of it."""
+    for setting, field in fields.items():
+        if key.startswith(f"{setting}.") and dict not in types_in(field.annotation):
+            return setting
+    return key
+
+
 def key_of(error: pydantic.ValidationError, group: str = "") -> str:
     """The dotted key of the first mistake; that of a group for a rule that joins its settings."""
     return ".".join(path_of(error, group))
@@ -138,8 +152,18 @@ def key_of(error: pydantic.ValidationError, group: str = "") -> str:
 
 def path_of(error: pydantic.ValidationError, group: str = "") -> list[str]:
     """The names of `key_of`, of which an unknown one may have dots itself."""
+    return _path(error.errors()[0], group)
+
+
+def _items(mistake: Mapping[str, Any]) -> list[int]:
+    """The numbers of the items of nested lists in which pydantic found a mistake."""
+    return [part for part in mistake["loc"] if isinstance(part, int)]
+
+
+def _path(mistake: Mapping[str, Any], group: str) -> list[str]:
+    """The names at which pydantic found a mistake, without the numbers of a list's items."""
     parents = group.split(".") if group else []
-    return parents + [part for part in error.errors()[0]["loc"] if isinstance(part, str)]
+    return parents + [part for part in mistake["loc"] if isinstance(part, str)]
 
 
 def unit_of(text: str) -> str:

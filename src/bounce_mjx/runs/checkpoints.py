@@ -43,9 +43,9 @@ from bounce_mjx.runs.config import (
     RESUMABLE_KEYS,
     TrainConfig,
     load_run_config,
-    runs_folder,
     without_own_settings,
 )
+from bounce_mjx.runs.creation import create_run
 from bounce_mjx.runs.records import RECORD, Checkpoint, DamagedCheckpoint, Record, verify
 from bounce_mjx.runs.storage import plain_path, seal, to_plain
 from bounce_mjx.task.registry import DEFAULT
@@ -77,12 +77,6 @@ def read_policy(checkpoint: Checkpoint, config: TrainConfig) -> Policy:
     """Restores the policy of a checkpoint."""
     # Refuses a damaged one.
     read_record(checkpoint)
-    seeds = folders.runs_of_seeds(checkpoint.run)
-    if seeds != [checkpoint.run] and not (checkpoint.folder / POLICY).is_dir():
-        raise UserError(
-            f"{checkpoint.folder} holds the state of all {len(seeds)} seeds, with which a training "
-            f"resumes; give {checkpoint.run} for its best policy, or a seed such as {seeds[0]}"
-        )
     policy = _read_arrays(checkpoint, POLICY, policy_shapes(config))
     for path, array in jax.tree_util.tree_leaves_with_path(policy):
         if not np.all(np.isfinite(array)):
@@ -181,18 +175,18 @@ def read_warm_start(config: TrainConfig, env: Env) -> tuple[Params, RunningStati
             f"{algorithm.__name__} makes networks of its own, which --warm-start cannot fill; "
             "leave one of them out"
         )
-    checkpoint = folders.choose_checkpoint(config.warm_start, runs_folder(config.env.task))
-    own = load_run_config(checkpoint.run)
+    checkpoint = folders.find_checkpoint(config.warm_start)
+    trained = load_run_config(checkpoint.run)
     keys = set(NETWORK_KEYS)
-    has_same_networks = own.ppo.model_dump(include=keys) == config.ppo.model_dump(include=keys)
-    has_same_shapes = policy_shapes(own) == policy_shapes(config)
-    has_same_layout = own.env.layout == config.env.layout
+    has_same_networks = trained.ppo.model_dump(include=keys) == config.ppo.model_dump(include=keys)
+    has_same_shapes = policy_shapes(trained) == policy_shapes(config)
+    has_same_layout = trained.env.layout == config.env.layout
     if not (has_same_networks and has_same_shapes and has_same_layout):
         raise UserError(
             f"the policy {config.warm_start} has another observation, other actions or other "
             "hidden layers than this training; leave out the flags that change them"
         )
-    params, statistics, names = read_networks(checkpoint, own)
+    params, statistics, names = read_networks(checkpoint, trained)
     wanted = names_of_critic_metrics(config.ppo, env)
 
     def moved(array: jax.Array, default: float) -> np.ndarray:
@@ -300,7 +294,7 @@ def write_run(config: TrainConfig, steps: int, policy: Policy) -> Path:
     Raises:
       UserError: the folder cannot be written.
     """
-    run = folders.create_run(config)
+    run = create_run(config)
     save_checkpoint(run, config, steps, {POLICY: policy})
     return run
 

@@ -205,19 +205,19 @@ def _check_task(env: WorldConfig, name: str) -> None:
 
 
 def fields_of(
-    env: type[WorldConfig], algorithm: type[PPOConfig] = PPOConfig
+    task_config: type[WorldConfig], algorithm_config: type[PPOConfig] = PPOConfig
 ) -> dict[str, FieldInfo]:
     """The settings of a training by their dotted keys, such as env.reward.height.weight.
 
     Args:
-      env: the settings of the task.
-      algorithm: the settings of the algorithm.
+      task_config: the type of the task's settings.
+      algorithm_config: that of the algorithm's.
 
     Raises:
       UserError: a setting of the task has the name of one of the algorithm.
     """
-    _check_names(env, algorithm)
-    groups = {"env": env, "ppo": algorithm}
+    _check_names(task_config, algorithm_config)
+    groups = {"env": task_config, "ppo": algorithm_config}
     fields = {}
     for name, field in TrainConfig.model_fields.items():
         if name in groups:
@@ -227,15 +227,15 @@ def fields_of(
     return fields
 
 
-def _check_names(env: type[WorldConfig], algorithm: type[PPOConfig]) -> None:
+def _check_names(task_config: type[WorldConfig], algorithm_config: type[PPOConfig]) -> None:
     """Checks that no setting of a task has the name of one of the algorithm: of both, the flag and
     the key that stands alone would be one, as in --num-envs.
 
     Raises:
       UserError: one has.
     """
-    for name in fields_in(env):
-        if name in algorithm.model_fields:
+    for name in fields_in(task_config):
+        if name in algorithm_config.model_fields:
             raise UserError(
                 f"env.{name} and ppo.{name} have the same name; give the setting of the task, or "
                 "of the algorithm, another one"

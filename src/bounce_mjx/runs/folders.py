@@ -1,5 +1,6 @@
-"""Folders of runs and checkpoints, and functions that find them. Everywhere, `run` is the path of a
-run's folder, and of a seed's, which looks like one; `training.run.Run` reads it for a user.
+"""Folders of runs and checkpoints, and functions that find them. Everywhere, a `run` is the path of
+a run's folder, or of a seed's, which looks like one (`training.run.Run` reads it for a user); a
+`place` is that or a path in it, such as a checkpoint.
 
     runs/<task>/<time stamp, UTC>/      <task> as in `runs_folder`: that of bounce is bounce_ball
         config.yaml                     the resolved config
@@ -27,57 +28,39 @@ What finds them, and raises a `UserError` where there is nothing:
 
 | from | function | finds |
 |---|---|---|
-| a user's word, or none | `run_or_newest` | what the word names, or the newest run |
+| a user's word, or none | `place_or_newest` | the place that it names, or the newest run |
 | | `choose_checkpoint` | the checkpoint to show: of the word, the newest run or the package |
-| a path, or a policy's name | `run_of` | the run's folder |
-| | `find_checkpoint` | the best checkpoint there, with several seeds that of the best one |
+| a place | `run_of` | its run |
+| a place, or a policy's name | `find_checkpoint` | the best checkpoint there, of the best seed |
 | a run's or a seed's own folder | `best_checkpoint`, `latest_checkpoint` | one of its own |
 | | `stored_checkpoints`, `runs_of_seeds` | all of its checkpoints or seeds |
 | a folder of runs | `runs_in` | all runs that have a checkpoint |
 """
 
 import contextlib
-import datetime
-import itertools
 import os
 import re
-import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from bounce_mjx.config.files import dump_config
-from bounce_mjx.config.user_code import code_file_of
 from bounce_mjx.errors import UserError, suggest, warn_once
-from bounce_mjx.lazy import mujoco
-from bounce_mjx.learning.registry import own_algorithm
 from bounce_mjx.resources import (
     POLICIES,
     PRETRAINED,
     TASK_POLICIES,
-    VERSION,
     policy_folder,
     policy_path,
     resource_path,
 )
-from bounce_mjx.runs.config import (
-    CONFIG_FILE,
-    ROBOT,
-    TrainConfig,
-    dump_sources,
-    load_run_config,
-    runs_folder,
-)
-from bounce_mjx.runs.presets import BASE
+from bounce_mjx.runs.config import CONFIG_FILE, load_run_config, runs_folder
 from bounce_mjx.runs.progress import load_results
 from bounce_mjx.runs.records import Checkpoint, DamagedCheckpoint, Record, verify
-from bounce_mjx.runs.storage import seal, writable, write_atomically
-from bounce_mjx.task.registry import DEFAULT, find_task, own_task
+from bounce_mjx.task.registry import DEFAULT, find_task
 
 LATEST = "latest"
 """Name of the newest run on the command line."""
 CHECKPOINTS = "checkpoints"
-
 
 MIRROR_LAW = Checkpoint(Path("mirror law"), Path("mirror law"), 0)
 """In place of a checkpoint, the baseline `baselines.mirror`."""
@@ -92,93 +75,6 @@ def is_users_run(run: Path) -> bool:
     return os.path.realpath(run) not in policies
 
 
-def create_run(config: TrainConfig) -> Path:
-    """Creates a new run's folder, named after the current time (UTC), with the config in it.
-
-    Raises:
-      UserError: the folder cannot be written, or the robot cannot be copied into it.
-    """
-    # Not the local time, which is another one on another machine, and in autumn goes back.
-    stamp = datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d_%H-%M-%S")
-    with writable(config.log_dir, "choose another folder with --log-dir"):
-        config.log_dir.mkdir(parents=True, exist_ok=True)
-        for copy in itertools.count(1):
-            folder = config.log_dir / (stamp if copy == 1 else f"{stamp}_{copy}")
-            with contextlib.suppress(FileExistsError):
-                folder.mkdir()
-                break
-        try:
-            save_config(folder, config)
-        except (UserError, OSError):
-            shutil.rmtree(folder, ignore_errors=True)
-            raise
-    return folder
-
-
-def save_config(run: Path, config: TrainConfig) -> None:
-    """Writes the run's resolved config, and copies of its robot and of the code of its own task and
-    algorithm, unless the run has them."""
-    own = {"task": own_task(config.task), "algorithm": own_algorithm(config.algorithm)}
-    for key, kind in own.items():
-        code = None if kind is None else code_file_of(kind)
-        if code is not None and not (run / key).exists():
-            (run / key).mkdir()
-            write_atomically(run / key / code.path.name, code.content)
-    if (mjcf := config.env.mjcf) is not None:
-        # As a config's own path is absolute and without .. in it.
-        here = Path(os.path.abspath(run))
-        if not mjcf.is_relative_to(here / ROBOT):
-            mjcf = copy_robot(mjcf, here)
-        # The run's folder may be moved.
-        env = config.env.model_copy(update={"mjcf": mjcf.relative_to(here)})
-        config = config.model_copy(update={"env": env})
-    write_config(run, config)
-
-
-def copy_robot(mjcf: Path, run: Path) -> Path:
-    """Copies an MJCF file with its meshes, textures and included files into a run's folder, sealed
-    by a manifest.
-
-    Args:
-      mjcf: a file that MuJoCo compiles, as for `locate`.
-
-    Returns:
-      The copy of the MJCF file.
-
-    Raises:
-      OSError: a file cannot be read or written.
-      UserError: the file is missing, or names another file by its absolute path.
-    """
-    from bounce_mjx.robot.arm import locate
-
-    mjcf = locate(mjcf)
-    folder = run / ROBOT
-    files = _files_of(mjcf)
-    root = Path(os.path.commonpath([path.parent for path in files]))
-    for path in files:
-        copy = folder / path.relative_to(root)
-        copy.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(path, copy)
-    seal(folder)
-    copied = folder / Path(os.path.abspath(mjcf)).relative_to(root)
-    # An absolute path in the copy still leads to the original.
-    if outside := set(_files_of(copied)) & set(files):
-        shutil.rmtree(folder)
-        raise UserError(f"{mjcf} names {min(outside)} by an absolute path; give a relative one")
-    return copied
-
-
-def _files_of(mjcf: Path) -> list[Path]:
-    """An MJCF file and every file that it names."""
-    return [Path(os.path.abspath(name)) for name in mujoco.mju_getXMLDependencies(str(mjcf))]
-
-
-def write_config(run: Path, config: TrainConfig) -> None:
-    """Writes the run's config as it is, without copies."""
-    head = f"# bounce_mjx {VERSION}\n{BASE}: null\n"
-    write_atomically(run / CONFIG_FILE, head + dump_config(config) + dump_sources(config))
-
-
 def runs_of_seeds(run: Path) -> list[Path]:
     """Existing folders of a run's seeds, such as seed_003; the run itself if it has one seed."""
     found = []
@@ -188,75 +84,50 @@ def runs_of_seeds(run: Path) -> list[Path]:
     return sorted(found) or [run]
 
 
-@contextlib.contextmanager
-def lock_run(run: Path) -> Iterator[None]:
-    """Holds the lock that gives a run's folder a single writer; the kernel releases it when the
-    process dies.
-
-    On a file system without locks on folders, such as NFS, and on Windows, every process gets it.
-
-    Raises:
-      UserError: another process holds the lock.
-    """
-    try:
-        import fcntl
-    except ImportError:
-        yield
-        return
-    descriptor = os.open(run, os.O_RDONLY)
-    try:
-        # Any other OSError means that the file system has no locks.
-        with contextlib.suppress(OSError):
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as error:
-                raise UserError(
-                    f"{run} is in use by another training process; stop it, or wait for its end"
-                ) from error
-        yield
-    finally:
-        os.close(descriptor)
-
-
-def run_of(path: Path) -> Path:
-    """Folder of the run that contains a path; the path may be the folder itself."""
+def run_of(place: Path) -> Path:
+    """Folder of the run of a place."""
     # Unlike os.path.isdir, Path.is_dir raises an error for a name that is too long.
-    if not os.path.isdir(path):
-        near = suggest(str(path), [LATEST, *POLICIES])
+    if not os.path.isdir(place):
+        near = suggest(str(place), [LATEST, *POLICIES])
         advice = near or "give a run's folder such as runs/bounce_ball/<time stamp>"
-        raise UserError(f"there is no run and no policy {path}; {advice}")
-    for folder in (path, *Path(os.path.abspath(path)).parents):
+        raise UserError(f"there is no run and no policy {place}; {advice}")
+    for folder in (place, *Path(os.path.abspath(place)).parents):
         if (folder / CONFIG_FILE).is_file():
             return folder
+    if runs := runs_in(place):
+        raise UserError(f"{place} is a folder of runs; give one of them, such as {runs[-1]}")
     raise UserError(
-        f"{path} is not in a run's folder, as there is no {CONFIG_FILE}; give a folder that "
+        f"{place} is not in a run's folder, as there is no {CONFIG_FILE}; give a folder that "
         "bounce-mjx train made"
     )
 
 
-def is_newest(path: Path | None) -> bool:
-    """Whether what the user gives as a run stands for the newest one: nothing, or `LATEST` unless
-    there is a folder with that name."""
+def means_newest(path: Path | None) -> bool:
+    """Whether what the user gives as a run means the newest one: nothing, or `LATEST` unless there
+    is a folder with that name."""
     return path is None or (str(path) == LATEST and not os.path.isdir(path))
 
 
-def check_newest(paths: Sequence[Path | None]) -> None:
-    """Checks that the newest run is looked for, where the user says in which folder.
+def check_log_dir(paths: Sequence[Path | None]) -> None:
+    """Checks that --log-dir, where the newest run is looked for, has an effect.
+
+    Args:
+      paths: what the user gives as runs.
 
     Raises:
-      UserError: each path is that of a run or a policy.
+      UserError: each is that of a run or a policy.
     """
-    if not any(map(is_newest, paths)):
+    if not any(map(means_newest, paths)):
         raise UserError(
             f"--log-dir is where the newest run is looked for, and {paths[0]} is named; omit one "
             "of them"
         )
 
 
-def run_or_newest(path: Path | None, log_dir: Path) -> Path:
-    """A run's folder or a path in it, as the user named it; where it names none (`is_newest`), the
-    newest run with a checkpoint in `log_dir`."""
-    if not is_newest(path):
+def place_or_newest(path: Path | None, log_dir: Path) -> Path:
+    """The place that the user names; where that is none (`means_newest`), the newest run with a
+    checkpoint in `log_dir`."""
+    if not means_newest(path):
         return path
     if not (found := runs_in(log_dir)):
         raise UserError(
@@ -283,12 +154,23 @@ def find_checkpoint(path: str | Path) -> Checkpoint:
       path: a run's folder (finds its best checkpoint, or its latest if there is no best), a folder
         of checkpoints in it, or a checkpoint; or a name in `POLICIES`, unless there is a folder
         with that name.
+
+    Raises:
+      UserError: there is none, or it is none of a policy but that of a run's several seeds.
     """
-    path = policy_path(path)
-    run = run_of(path)
-    if os.path.samefile(path, run):
-        path = run = _best_seed(run)
-    return best_checkpoint(run, path)
+    place = policy_path(path)
+    run = run_of(place)
+    if os.path.samefile(place, run):
+        run = _best_seed(run)
+        place = run
+    seeds = runs_of_seeds(run)
+    if seeds == [run]:
+        return best_checkpoint(run, place)
+    advice = f"give {run} for its best policy, or a seed such as {seeds[0]}"
+    if place == run:
+        advice = f"no policy is evaluated yet; resume it: bounce-mjx train {run}"
+    state = f"holds the state of all {len(seeds)} seeds, with which a training resumes"
+    raise UserError(f"{place} {state}; {advice}")
 
 
 def latest_checkpoint(run: Path, place: Path | None = None) -> Checkpoint:
@@ -391,18 +273,18 @@ def choose_checkpoint(
     if policy_folder(path):
         return find_checkpoint(path)
     try:
-        run = run_or_newest(path, log_dir)
+        place = place_or_newest(path, log_dir)
     except UserError:
         policy = _policy_of_folder(log_dir)
         if path is not None or policy is None:
             raise
         tell(f"no run in {log_dir}: using the policy that comes with the package")
         return find_checkpoint(resource_path(POLICIES[policy]))
-    if run != path:
-        results = load_results(_best_seed(run))
+    if place != path:
+        results = load_results(_best_seed(place))
         known = results.best.summary if results else "not evaluated"
-        tell(f"using the newest run: {run}{_arm_of(run)} ({known})")
-    return find_checkpoint(run)
+        tell(f"using the newest run: {place}{_arm_of(place)} ({known})")
+    return find_checkpoint(place)
 
 
 def _arm_of(run: Path) -> str:

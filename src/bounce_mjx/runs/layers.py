@@ -1,23 +1,14 @@
 """The settings of a training, from wherever they come.
 
 One word fixes the classes (`start.py`): which task, which algorithm and which policy or run a
-training begins with. Everything else is values. They are layers, and a later one wins:
-
-    1. the defaults of the task and of the algorithm
-    2. the preset for this machine
-    3. what the user's own algorithm changes of PPO's defaults
-    4. a preset that the user names, in place of the machine's
-    5. a warm start: the environment and the networks of a policy
-    6. the user's files and further presets, each on those before it
-    7. --robot, or the robot of --world; its file may say something of the training, too; a warm
-       start brings its own, beside which there is no --robot
-    8. --world
-    9. what the user says: flags of the command, or arguments of `train`
+training begins with. Everything else is values. They are layers, in the order of `ORDER`, and a
+later one wins.
 
 A resumed run has two: its own config, and what the user says; more steps end its
-`stop_when_solved` where that had ended it (`Layers._beyond_solved`). `layers_on` reads the layers
-below the user's, each file once. `Layers.config` merges all of them and validates the result, once;
-the config then knows what set each of its values (`TrainConfig.sources`).
+`stop_when_solved` where that had ended it (`Layers._beyond_solved`). A whole config, of Python, has
+no presets below it. `layers_on` reads the layers below the user's, each file once. `Layers.config`
+merges all of them and validates the result, once; the config then knows what set each of its values
+(`TrainConfig.sources`).
 """
 
 import dataclasses
@@ -26,7 +17,7 @@ import itertools
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pydantic
 from pydantic.fields import FieldInfo
@@ -36,16 +27,32 @@ from bounce_mjx.config.settings import default_of, has_default, merged, nested
 from bounce_mjx.config.validation import describe, groups_of, path_of
 from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.learning.config import NETWORK_KEYS, PPOConfig
-from bounce_mjx.runs.config import (
-    DEFAULT_SOURCE,
-    RESUMABLE_KEYS,
-    TrainConfig,
+from bounce_mjx.runs.config import DEFAULT_SOURCE, RESUMABLE_KEYS, TrainConfig
+from bounce_mjx.runs.presets import (
+    BASE,
+    SOURCES,
+    ConfigFile,
+    preset_files,
+    read_config_file,
+    shown_file,
 )
-from bounce_mjx.runs.presets import BASE, SOURCES, preset_files, read_config_file, shown_file
 from bounce_mjx.runs.start import Choice, FileFlags, Start, check_not_given, find_start
 from bounce_mjx.runs.worlds import Layer, layers_of_environment
 from bounce_mjx.world.named import without_idle_curriculum
 
+ORDER = (
+    "the defaults of the task and of the algorithm",
+    "the preset for this machine",
+    "what your own algorithm changes of PPO's defaults",
+    "a preset that you name, in place of the machine's",
+    "the policy of a warm start: its environment and its networks' settings",
+    "your files and further presets, each on those before it",
+    "a robot: `--robot`, or that of `--world`",
+    "a world: `--world`",
+    "what you say: flags, or arguments of `train`",
+)
+"""The layers of a new training, the lowest first. A robot's file may say something of the training,
+too. A warm start brings its own robot, beside which there is no other."""
 FLAGS = "flags"
 """Source of the settings on a command line."""
 PYTHON = "train"
@@ -55,62 +62,88 @@ PYTHON = "train"
 # Reading: what lies on what ---------------------------------------------------------------------
 
 
-def read_layers(
-    choice: Choice, machine: Path | None = None, whole_config: TrainConfig | None = None
-) -> "Layers":
+def read_layers(choice: Choice, machine: Path | None = None) -> "Layers":
     """The layers of a choice, without what the user says.
 
     Args:
-      machine, whole_config: as for `layers_on`.
+      machine: see `layers_on`.
 
     Raises:
       UserError: as `find_start` and `layers_on`.
     """
-    return layers_on(find_start(choice.word, choice, whole_config), choice, machine, whole_config)
+    return layers_on(find_start(choice.word, choice), choice, machine)
 
 
-def layers_on(
-    start: Start,
-    files: FileFlags,
-    machine: Path | None = None,
-    whole_config: TrainConfig | None = None,
-) -> "Layers":
+def layers_on(start: Start, files: FileFlags, machine: Path | None = None) -> "Layers":
     """The layers on a start, without what the user says.
 
     Args:
       machine: the machine's preset; None asks JAX, which starts its devices.
-      whole_config: a config that takes the place of files, and stands alone.
 
     Raises:
       UserError: a file is missing, wrong, or of another start.
     """
     if start.resumed is not None:
-        config = files.config or whole_config
-        given = {"config": config, "robot": files.robot, "world": files.world}
-        check_not_given(start.run, given)
-        return Layers(start, (Layer(f"the run {start.run}", start.resumed.model_dump()),))
-    machines: list[Layer] = []
-    named: list[Layer] = []
-    if whole_config is not None:
-        own = [Layer("config", whole_config.model_dump(), whole=("env", "ppo"))]
+        given = {"config": files.config, "robot": files.robot, "world": files.world}
+        check_not_given(start.place, given)
+        return Layers(start, (Layer(f"the run {start.place}", start.resumed.model_dump()),))
+    if start.whole is None:
+        read = _layers_of_config(start, files.config, machine)
     else:
-        found = preset_files(files.config, start.task_name, machine)
-        machines = _layers_of_files([found.machine])
-        named = _layers_of_files([found.named])
-        own = _layers_of_files(found.own)
-        for layer in (*named, *own):
-            _check_start(layer, start)
+        read = _layers_of_whole(start.whole, start.warm_start)
     changed = _changed_defaults(start.algorithm_config)
     trained = None if start.policy is None else start.policy.env
     of_env = layers_of_environment(start.task, trained, files.robot, files.world)
     for layer in of_env.robot:
         _check_start(layer, start)
     policies = [_with_networks(layer, start) for layer in of_env.policy]
+    changes = _notes(changed, read.preset, "ppo.") + _notes(read.preset, policies, "env.")
     return Layers(
         start=start,
-        below=(*machines, *changed, *named, *policies, *own, *of_env.robot, *of_env.world),
-        notes=(*start.notes, *_notes(changed, named, "ppo."), *_notes(named, policies, "env.")),
+        # In the order of `ORDER`.
+        below=(
+            *read.machine,
+            *changed,
+            *read.preset,
+            *policies,
+            *read.files,
+            *of_env.robot,
+            *of_env.world,
+        ),
+        notes=(*start.notes, *changes),
     )
+
+
+class ConfigLayers(NamedTuple):
+    """The settings that `--config` stands for, as `PresetFiles`."""
+
+    machine: list[Layer]
+    """One layer or none."""
+    preset: list[Layer]
+    """One layer or none."""
+    files: list[Layer]
+
+
+def _layers_of_config(start: Start, config: Sequence[Path], machine: Path | None) -> ConfigLayers:
+    """The layers of presets and files.
+
+    Raises:
+      UserError: a file is missing, wrong, or of another start.
+    """
+    read = ConfigLayers(*map(_layers_of_files, preset_files(config, start.task_name, machine)))
+    for layer in (*read.preset, *read.files):
+        _check_start(layer, start)
+    return read
+
+
+def _layers_of_whole(whole: TrainConfig, warm_start: Path | None) -> ConfigLayers:
+    """The layer of a whole config of Python, which has no preset below it.
+
+    Args:
+      warm_start: the policy that was found for its own.
+    """
+    values = whole.model_dump() | {"warm_start": warm_start}
+    return ConfigLayers([], [], [Layer("config", values, replaces=("env", "ppo"))])
 
 
 def _check_start(layer: Layer, start: Start) -> None:
@@ -137,15 +170,12 @@ def _check_start(layer: Layer, start: Start) -> None:
             )
 
 
-def _layers_of_files(files: Iterable[Path | None]) -> list[Layer]:
-    """A layer of each file; none for None."""
+def _layers_of_files(files: Iterable[ConfigFile]) -> list[Layer]:
+    """A layer of each file, with its settings alone."""
     layers = []
-    for file in files:
-        if file is not None:
-            values = read_config_file(file)
-            values.pop(BASE, None)
-            values.pop(SOURCES, None)
-            layers.append(Layer(shown_file(file), values))
+    for path, values in files:
+        settings = {key: value for key, value in values.items() if key not in (BASE, SOURCES)}
+        layers.append(Layer(shown_file(path), settings))
     return layers
 
 
@@ -154,16 +184,18 @@ def _title_of(layers: Sequence[Layer]) -> str:
     return " on ".join(layer.source for layer in reversed(layers))
 
 
-def _changed_defaults(algorithm: type[PPOConfig]) -> list[Layer]:
+def _changed_defaults(algorithm_config: type[PPOConfig]) -> list[Layer]:
     """What an algorithm of the user's changes of PPO's defaults: it means these values, unlike a
     preset that was made for PPO. They are a layer, so that they lie above the machine's preset."""
     changed = {}
     for key, field in PPOConfig.model_fields.items():
-        own_field = algorithm.model_fields[key]
+        own_field = algorithm_config.model_fields[key]
         # A narrower type without a default says nothing of the value.
         if has_default(own_field) and default_of(own_field) != field.default:
             changed[key] = default_of(own_field)
-    return [Layer(f"defaults of {algorithm.__qualname__}", {"ppo": changed})] if changed else []
+    if not changed:
+        return []
+    return [Layer(f"defaults of {algorithm_config.__qualname__}", {"ppo": changed})]
 
 
 def _notes(below: list[Layer], above: list[Layer], prefix: str) -> list[str]:
@@ -284,15 +316,15 @@ class Layers:
     def _layer_of_user(self, source: str, said: Mapping[str, Any]) -> Layer:
         """The user's values in their groups."""
         values: dict[str, Any] = {}
-        whole = []
+        replaced = []
         for key, value in said.items():
             full_key = self._full_key(key)
             plain = value
             if isinstance(value, pydantic.BaseModel):
                 plain = value.model_dump()
-                whole.append(full_key)
+                replaced.append(full_key)
             values = merged(values, nested(full_key, plain))
-        return Layer(source, values, whole=tuple(whole))
+        return Layer(source, values, replaces=tuple(replaced))
 
     def _full_key(self, key: str) -> str:
         """The dotted key of a setting or a group that stands alone, the training's own first; an
@@ -305,13 +337,13 @@ class Layers:
     def _beyond_solved(self, user: Layer) -> list[Layer]:
         """A layer for a run that has met all results, where a number of steps is asked for: it goes
         on to that number."""
-        if self.start.run is None or "total_steps" not in user.values:
+        if self.start.resumed is None or "total_steps" not in user.values:
             return []
         from bounce_mjx.runs.folders import latest_checkpoint, run_of
         from bounce_mjx.runs.progress import Progress, are_solved
         from bounce_mjx.runs.records import verify
 
-        checkpoint = latest_checkpoint(run_of(self.start.run), self.start.run)
+        checkpoint = latest_checkpoint(run_of(self.start.place), self.start.place)
         progress = verify(checkpoint).progress
         seeds = [Progress.model_validate(seed) for seed in progress.get("seeds", [progress])]
         if are_solved(seeds):
@@ -319,6 +351,11 @@ class Layers:
         return []
 
     def _validated(self, values: dict[str, Any]) -> TrainConfig:
+        """The typed config of nested values.
+
+        Raises:
+          _Mistake: a key is unknown, or a value is out of range.
+        """
         groups = {"env": self.start.task.Config, "ppo": self.start.algorithm_config}
         typed = dict(values)
         for name, kind in groups.items():
@@ -347,7 +384,7 @@ def _merge(layers: Sequence[Layer]) -> tuple[dict[str, Any], dict[str, str]]:
     values: dict[str, Any] = {}
     sources: dict[str, str] = {}
     for layer in layers:
-        for key in layer.whole:
+        for key in layer.replaces:
             values = _without(values, key)
         values = merged(values, layer.values)
         if layer.is_world:
@@ -398,6 +435,7 @@ def _has(values: dict[str, Any], path: Sequence[str], may_be_empty: bool) -> boo
 
 
 def _check_resumable(resumed: TrainConfig, config: TrainConfig) -> None:
+    """Raises UserError where a resumed run would be another training."""
     if changed := differing_keys(resumed, config) - RESUMABLE_KEYS:
         raise UserError(
             f"a resumed run cannot change {', '.join(sorted(changed))}; leave those out, or start "
@@ -424,7 +462,9 @@ def read_preset(
       UserError: as `read_layers` and `Layers.config`.
     """
     files = (config,) if isinstance(config, Path) else tuple(config or ())
-    for layer in reversed(_layers_of_files(file for file in files if os.path.isfile(file))):
-        task = task or layer.values.get("task")
+    if task is None:
+        # In place of the word, which no user says here.
+        for file in filter(os.path.isfile, files):
+            task = read_config_file(file).get("task", task)
     choice = Choice(word=task, config=files, robot=robot, world=world)
     return read_layers(choice, machine).config()

@@ -27,15 +27,22 @@ WORLDS = "configs/worlds"
 _EXAMPLE = "configs/default.yaml"
 
 
+class ConfigFile(NamedTuple):
+    """A config file, which is read once."""
+
+    path: Path
+    values: dict[str, Any]
+
+
 class PresetFiles(NamedTuple):
     """The files of a config; each lies on those before it."""
 
-    machine: Path | None
-    """The preset for this machine, where the user names no other one."""
-    named: Path | None
-    """The preset that the user names."""
-    own: tuple[Path, ...]
-    """The user's files."""
+    machine: list[ConfigFile]
+    """The preset for this machine, where the user names no other one; else none."""
+    preset: list[ConfigFile]
+    """The preset that the user names; or none."""
+    files: list[ConfigFile]
+    """The user's files, and further presets."""
 
 
 def preset_files(config: Sequence[Path], task: str, machine: Path | None = None) -> PresetFiles:
@@ -55,38 +62,39 @@ def preset_files(config: Sequence[Path], task: str, machine: Path | None = None)
     """
     of_task = f"{PRESETS}/{task}"
     # The task's own first; a word that is none of these is looked for in the presets of all tasks.
-    files = [named_file(named_file(file, of_task), PRESETS, "preset") for file in config]
-    bases = {}
-    for file in files:
-        values = read_config_file(file)
-        if BASE in values:
-            bases[file] = values[BASE]
+    paths = [named_file(named_file(path, of_task), PRESETS, "preset") for path in config]
+    files = [ConfigFile(path, read_config_file(path)) for path in paths]
     for file in files[1:]:
-        if bases.get(file) is not None:
-            raise UserError(f"{file} lies on {files[0]}, so its {BASE} is not used; give it first")
-    if not files or files[0] not in bases:
+        if file.values.get(BASE) is not None:
+            raise UserError(
+                f"{file.path} lies on {paths[0]}, so its {BASE} is not used; give it first"
+            )
+    if not files or BASE not in files[0].values:
         # The first file is silent: on the machine's.
         base = machine or default_preset(has_accelerator())
-        return PresetFiles(_preset(str(base), of_task), None, tuple(files))
-    base = bases[files[0]]
+        return PresetFiles(_preset(str(base), of_task), [], files)
+    base = files[0].values[BASE]
     if base is not None:
         # It names one.
-        named = _preset(str(base), of_task)
-        if named is None:
+        preset = _preset(str(base), of_task)
+        if not preset:
             raise UserError(
-                f"{files[0]}: {BASE} is {shorten(repr(base))}; give the name of a preset, or null"
+                f"{paths[0]}: {BASE} is {shorten(repr(base))}; give the name of a preset, or null"
             )
-        return PresetFiles(None, named, tuple(files))
+        return PresetFiles([], preset, files)
     # It stands alone: a preset of the package, or a file of the user's.
-    if files[0].resolve().is_relative_to(resource_path(PRESETS).resolve()):
-        return PresetFiles(None, files[0], tuple(files[1:]))
-    return PresetFiles(None, None, tuple(files))
+    if paths[0].resolve().is_relative_to(resource_path(PRESETS).resolve()):
+        return PresetFiles([], files[:1], files[1:])
+    return PresetFiles([], [], files)
 
 
-def _preset(name: str, of_task: str) -> Path | None:
-    """The preset of a name, a task's own one first."""
-    paths = [resource_path(f"{folder}/{name}.yaml") for folder in (of_task, PRESETS)]
-    return next((path for path in paths if os.path.isfile(path)), None)
+def _preset(name: str, of_task: str) -> list[ConfigFile]:
+    """The preset of a name, of two the task's own one; empty without one."""
+    for folder in (of_task, PRESETS):
+        path = resource_path(f"{folder}/{name}.yaml")
+        if os.path.isfile(path):
+            return [ConfigFile(path, read_config_file(path))]
+    return []
 
 
 def named_file(path: Path, folder: str, kind: str | None = None) -> Path:
@@ -129,7 +137,8 @@ def read_config_file(
     values = read_mapping(path, kind, example)
     for key in {"task", "algorithm"} & values.keys():
         if not isinstance(values[key], str):
-            raise UserError(f"{shown_file(path)}: {key} is {values[key]}, but must be a name")
+            given = "null" if values[key] is None else values[key]
+            raise UserError(f"{shown_file(path)}: {key} is {given}, but must be a name")
     env = values.get("env")
     mjcf = env.get("mjcf") if isinstance(env, dict) else None
     if isinstance(mjcf, str) and not mjcf.startswith("~") and not is_packaged(Path(mjcf)):

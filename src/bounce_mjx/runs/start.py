@@ -86,7 +86,9 @@ class Start(NamedTuple):
     """Config of the policy of a warm start."""
     warm_start: Path | None = None
     """Name of that policy, or its checkpoint's folder."""
-    run: Path | None = None
+    whole: TrainConfig | None = None
+    """A whole config, of Python, whose task and algorithm these are; no preset lies below it."""
+    place: Path | None = None
     """Folder of the run that is resumed, or a checkpoint in it."""
     resumed: TrainConfig | None = None
     """Config of that run."""
@@ -99,31 +101,32 @@ class Start(NamedTuple):
         return fields_of(self.task.Config, self.algorithm_config)
 
 
-def find_start(
-    word: str | None, flags: StartFlags, whole_config: TrainConfig | None = None
-) -> Start:
+def find_start(word: str | None, flags: StartFlags, whole: TrainConfig | None = None) -> Start:
     """What the first word means: a task, a policy or a run; and what is said beside it.
 
     Args:
-      word: None for the default task, or that of a warm start.
-      whole_config: whose task and algorithm these are, in place of a word.
+      word: None for the default task, or that of a whole config or a warm start.
+      whole: see `Start`.
 
     Raises:
       UserError: there is no such thing, or two of these exclude each other.
     """
     if word is None or is_task(word):
-        return _new_start(word, flags.warm_start, flags, whole_config)
+        return _new_start(word, flags.warm_start, flags, whole)
     if policy_folder(word):
         if flags.warm_start is not None:
             raise UserError(
                 f"{word} and the warm start {flags.warm_start} are two policies; leave one out"
             )
-        return _new_start(None, Path(word), flags, whole_config)
+        return _new_start(None, Path(word), flags, whole)
     # Imports JAX, which a task's help does not need.
-    from bounce_mjx.runs.folders import LATEST, is_newest
+    from bounce_mjx.runs.folders import LATEST, means_newest
 
-    if is_newest(Path(word)) or os.path.isdir(word):
-        return _start_of_run(Path(word), flags)
+    if means_newest(Path(word)) or os.path.isdir(word):
+        return _start_of_run(Path(word), flags, whole)
+    if os.path.isfile(word):
+        flag = "--import" if word.endswith(".py") else "--config"
+        raise UserError(f"{word} is a file, and no task, policy or run; give {flag} {word}")
     known = list(dict.fromkeys((*registered_tasks(), *POLICIES)))
     own = "a run's folder, or --import FILE.py for a task of your own"
     advice = suggest(word, [*known, LATEST]) or f"give {', '.join(known)}, {own}"
@@ -131,41 +134,45 @@ def find_start(
 
 
 def _new_start(
-    word: str | None, warm_start: Path | None, flags: StartFlags, whole_config: TrainConfig | None
+    word: str | None, named: Path | None, flags: StartFlags, whole: TrainConfig | None
 ) -> Start:
     """The start of a new run.
 
     Args:
       word: the task, if the user names it.
-      warm_start: the policy from whose networks and environment it starts.
+      named: the policy of a warm start, if the user names it.
     """
     said: dict[str, Any] = {}
-    policy, notes = None, ()
+    warm_start = named
+    if named is None and whole is not None:
+        warm_start = whole.warm_start
+    policy: TrainConfig | None = None
+    notes: tuple[str, ...] = ()
     if warm_start is not None:
-        folder = _folder_of_runs(flags.log_dir, word, whole_config)
+        folder = _folder_of_runs(flags.log_dir, word, whole)
         warm_start, policy, notes = _policy_of(warm_start, folder)
+    if named is not None:
         said["warm_start"] = warm_start
-    task = _task_of(word, whole_config, policy)
+    task = _task_of(word, whole, policy)
     if word is not None:
         said["task"] = task_name(task)
-    algorithm_name, settings = _algorithm(flags.algorithm, whole_config)
+    algorithm_name, algorithm_config = _algorithm(flags.algorithm, whole)
     if flags.algorithm is not None:
         said["algorithm"] = algorithm_name
     return Start(
         task=task,
         task_name=task_name(task),
-        algorithm_config=settings,
+        algorithm_config=algorithm_config,
         algorithm_name=algorithm_name,
         said=said,
         policy=policy,
         warm_start=warm_start,
+        whole=whole,
         notes=notes,
     )
 
 
-def _task_of(
-    word: str | None, whole_config: TrainConfig | None, policy: TrainConfig | None
-) -> type[Task]:
+def _task_of(word: str | None, whole: TrainConfig | None, policy: TrainConfig | None) -> type[Task]:
     """The task that the word names; without one, that of a whole config, of the policy of a warm
     start, or the default.
 
@@ -174,13 +181,13 @@ def _task_of(
         policy's nor is extended by it.
     """
     if word is None:
-        config = whole_config or policy
+        config = whole or policy
         return find_task(DEFAULT) if config is None else config.env.task
     task = find_task(word)
-    if whole_config is not None and whole_config.env.task is not task:
+    if whole is not None and whole.env.task is not task:
         raise UserError(
-            f"the config is of the task {whole_config.task}, and the first argument is {word}; "
-            "leave it out"
+            f"the config is of the task {whole.task}, and the first argument is {word}; leave it "
+            "out"
         )
     if policy is not None:
         its_task = policy.env.task
@@ -206,15 +213,16 @@ def check_not_given(run: Path, given: Mapping[str, Any]) -> None:
             )
 
 
-def _start_of_run(word: Path, flags: StartFlags) -> Start:
+def _start_of_run(word: Path, flags: StartFlags, whole: TrainConfig | None) -> Start:
     """The start of a run that is resumed."""
-    from bounce_mjx.runs.folders import check_newest, run_of, run_or_newest
+    from bounce_mjx.runs.folders import check_log_dir, place_or_newest, run_of
 
     if flags.log_dir is not None:
-        check_newest([word])
-    check_not_given(word, {"algorithm": flags.algorithm, "warm_start": flags.warm_start})
+        check_log_dir([word])
+    given = {"algorithm": flags.algorithm, "warm_start": flags.warm_start, "config": whole}
+    check_not_given(word, given)
     # Without a folder, latest is the newest run of the default task.
-    place = run_or_newest(word, flags.log_dir or runs_folder(find_task(DEFAULT)))
+    place = place_or_newest(word, flags.log_dir or runs_folder(find_task(DEFAULT)))
     run = run_of(place)
     config = load_run_config(run)
     classes: dict[str, type] = {"task": config.env.task}
@@ -237,7 +245,7 @@ def _start_of_run(word: Path, flags: StartFlags) -> Start:
         algorithm_config=type(config.ppo),
         algorithm_name=config.algorithm,
         said={},
-        run=place,
+        place=place,
         resumed=config,
     )
 
@@ -253,39 +261,37 @@ def _policy_of(path: Path, log_dir: Path) -> tuple[Path, TrainConfig, tuple[str,
     return place, load_run_config(checkpoint.run), tuple(notes)
 
 
-def _folder_of_runs(
-    log_dir: Path | None, task: str | None, whole_config: TrainConfig | None
-) -> Path:
+def _folder_of_runs(log_dir: Path | None, task: str | None, whole: TrainConfig | None) -> Path:
     """Where the newest run is looked for: beside the new one, or among those of the task."""
     from bounce_mjx.runs.folders import runs_in
 
     # A new folder has no run yet that latest could stand for.
     if log_dir is not None and runs_in(log_dir):
         return log_dir
-    return runs_folder(whole_config.env.task if whole_config else find_task(task or DEFAULT))
+    return runs_folder(find_task(task or DEFAULT) if whole is None else whole.env.task)
 
 
-def _algorithm(name: str | None, whole_config: TrainConfig | None) -> tuple[str, type[PPOConfig]]:
-    """Name and settings of the algorithm.
+def _algorithm(name: str | None, whole: TrainConfig | None) -> tuple[str, type[PPOConfig]]:
+    """Name of the algorithm, and the type of its settings.
 
     Raises:
       UserError: there is none, or the whole config disagrees with itself.
     """
-    if whole_config is not None and name is None:
-        settings = _settings_of(whole_config.algorithm)
-        if settings is not type(whole_config.ppo):
+    if whole is not None and name is None:
+        algorithm_config = _config_of(whole.algorithm)
+        if algorithm_config is not type(whole.ppo):
             raise UserError(
-                f"the config's ppo is {type(whole_config.ppo).__qualname__}, and its algorithm "
-                f"{whole_config.algorithm} has {settings.__qualname__}; name the algorithm that "
+                f"the config's ppo is {type(whole.ppo).__qualname__}, and its algorithm "
+                f"{whole.algorithm} has {algorithm_config.__qualname__}; name the algorithm that "
                 "has them"
             )
-        return whole_config.algorithm, settings
+        return whole.algorithm, algorithm_config
     if name in (None, PPO_NAME):
         return PPO_NAME, PPOConfig
     algorithm = find_algorithm(name)
     return own_name(algorithm), algorithm.Config
 
 
-def _settings_of(algorithm: str) -> type[PPOConfig]:
-    """The settings of an algorithm by its name; PPO's without the import of JAX."""
+def _config_of(algorithm: str) -> type[PPOConfig]:
+    """Type of the settings of an algorithm, by its name; PPO's without the import of JAX."""
     return PPOConfig if algorithm == PPO_NAME else find_algorithm(algorithm).Config

@@ -1,4 +1,5 @@
-"""Files of a run: validated JSON, atomic writes, and a manifest that verifies a checkpoint."""
+"""Files of a run: validated JSON, atomic writes, a manifest that verifies a checkpoint, and the
+lock of a single writer."""
 
 import contextlib
 import hashlib
@@ -180,3 +181,33 @@ def _describe_files(folder: Path) -> dict[str, dict[str, int | str]]:
             entry = {"size": path.stat().st_size, "sha256": digest}
             entries[path.relative_to(folder).as_posix()] = entry
     return entries
+
+
+@contextlib.contextmanager
+def lock_run(run: Path) -> Iterator[None]:
+    """Holds the lock that gives a run's folder a single writer; the kernel releases it when the
+    process dies.
+
+    On a file system without locks on folders, such as NFS, and on Windows, every process gets it.
+
+    Raises:
+      UserError: another process holds the lock.
+    """
+    try:
+        import fcntl
+    except ImportError:
+        yield
+        return
+    descriptor = os.open(run, os.O_RDONLY)
+    try:
+        # Any other OSError means that the file system has no locks.
+        with contextlib.suppress(OSError):
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise UserError(
+                    f"{run} is in use by another training process; stop it, or wait for its end"
+                ) from error
+        yield
+    finally:
+        os.close(descriptor)

@@ -41,9 +41,9 @@ class Layer(NamedTuple):
     is_world: bool = False
     """Whether its values are of all terms of the randomisation. A preset's curriculum of terms that
     this world does not have is dropped (`without_idle_curriculum`)."""
-    whole: tuple[str, ...] = ()
-    """Dotted keys of what it brings whole: also of a mapping, such as `shares`, nothing remains of
-    the layers below."""
+    replaces: tuple[str, ...] = ()
+    """Dotted keys of which nothing remains of the layers below, also where they are mappings, such
+    as `shares`."""
 
 
 class EnvironmentLayers(NamedTuple):
@@ -165,7 +165,7 @@ def _layer_of_policy(trained: WorldConfig, is_in_world: bool) -> Layer:
     env = trained.model_dump()
     if is_in_world:
         del env["randomization"]
-    return Layer("the policy", {"env": env}, whole=tuple(f"env.{key}" for key in env))
+    return Layer("the policy", {"env": env}, replaces=tuple(f"env.{key}" for key in env))
 
 
 def _layer_of_world(task: type[Task], world: NamedWorld, path: Path) -> Layer:

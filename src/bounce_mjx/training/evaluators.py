@@ -126,11 +126,11 @@ class Evaluators:
         )
         return program.lower(shapes, np.uint32(0), np.int32(0))
 
-    def _run(self, policies: Sequence[Policy], seed: int, first: int, episodes: int) -> list[Chunk]:
+    def _run(self, policies: Sequence[Policy], seed: int, ready: int, episodes: int) -> list[Chunk]:
         """Simulates the chunks of an evaluation that are still missing.
 
         Args:
-          first: number of chunks that are there.
+          ready: number of chunks that are there.
           episodes: number of episodes that all chunks together have at least.
         """
         program = self._program.result()
@@ -145,7 +145,7 @@ class Evaluators:
             return jax.block_until_ready(chunk)
 
         with concurrent.futures.ThreadPoolExecutor(self._threads) as pool:
-            return list(pool.map(evaluate, range(first * self._chunk, episodes, self._chunk)))
+            return list(pool.map(evaluate, range(ready * self._chunk, episodes, self._chunk)))
 
     def _judge(self, chunks: Sequence[Chunk], episodes: int) -> list[Report]:
         """A report of each policy from the first episodes of an evaluation."""

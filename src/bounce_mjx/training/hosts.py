@@ -21,7 +21,7 @@ from jax._src import distributed
 from jax.sharding import Sharding
 
 from bounce_mjx.config.files import flat
-from bounce_mjx.errors import UserError, reason_of, shorten
+from bounce_mjx.errors import UserError, exit_on_user_error, reason_of, shorten
 from bounce_mjx.interrupt import in_daemon_thread, leave
 from bounce_mjx.runs.config import TrainConfig
 
@@ -30,14 +30,15 @@ Tree = TypeVar("Tree")
 # Time for the other processes to print their own sentences: once the leader has ended, JAX aborts
 # them at once.
 _GRACE_SECONDS = 1.0
-# Longer than any compilation, ms. JAX ends the wait for a dead process.
-_NO_LIMIT = 10**9
+# No time limit for a value of another process, ms: longer than any compilation. JAX ends the wait
+# for a dead process.
+_NO_LIMIT_MS = 10**9
 
 _exchanges = itertools.count()
 
 
 def join(
-    coordinator_address: str | None, num_processes: int | None, process_id: int | None, timeout: int
+    coordinator_address: str | None, num_processes: int | None, process_id: int | None, limit: int
 ) -> None:
     """Joins the processes of one run; it must be called before any other use of JAX. From now on,
     JAX aborts this process if another one has died.
@@ -45,20 +46,23 @@ def join(
     Slurm, Open MPI or Kubernetes supply what is None.
 
     Args:
-      timeout: seconds to wait for the other processes.
+      limit: time limit of the wait for the other processes, s.
 
     Raises:
       UserError: an argument is missing and no launcher supplies it, or the processes did not find
         each other in time.
     """
 
+    # Later than our own, as JAX's ends the process with a stack trace.
+    limit_of_jax = 2 * limit + 60
+
     def connect() -> None:
-        # JAX's own time limit ends the process with a stack trace.
-        limit = {"initialization_timeout": 2 * timeout + 60}
-        jax.distributed.initialize(coordinator_address, num_processes, process_id, **limit)
+        jax.distributed.initialize(
+            coordinator_address, num_processes, process_id, initialization_timeout=limit_of_jax
+        )
 
     try:
-        in_daemon_thread(connect).result(timeout)
+        in_daemon_thread(connect).result(limit)
         # Waits for the devices of all hosts.
         jax.devices()
     # One that is late is a TimeoutError without a text.
@@ -104,7 +108,7 @@ def exchange(value: Any) -> list[Any]:
     processes.client.key_value_set(own_key, json.dumps(value))
     values = []
     for i in range(processes.num_processes):
-        text = processes.client.blocking_key_value_get(f"bounce_mjx/{number}/{i}", _NO_LIMIT)
+        text = processes.client.blocking_key_value_get(f"bounce_mjx/{number}/{i}", _NO_LIMIT_MS)
         values.append(json.loads(text))
     if number > 0:
         # Each process has come here, and so has read all values of the exchange before.
@@ -113,11 +117,13 @@ def exchange(value: Any) -> list[Any]:
 
 
 @contextlib.contextmanager
-def leave_without_waiting() -> Iterator[None]:
-    """If one of several processes ends with a user's error, ends it without JAX's wait for the
-    others at exit, once they have had `_GRACE_SECONDS` for their own sentences."""
+def leave_on_user_error() -> Iterator[None]:
+    """As `exit_on_user_error`, within that of the command; but one of several processes leaves
+    without JAX's wait for the others at exit, once they have had `_GRACE_SECONDS` for their own
+    sentences."""
     try:
-        yield
+        with exit_on_user_error():
+            yield
     except SystemExit as error:
         if error.code and jax.distributed.is_initialized():
             time.sleep(_GRACE_SECONDS)

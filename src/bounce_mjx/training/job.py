@@ -6,7 +6,8 @@ From a signal to its checkpoint: `StopRequest` notes the signal, the block goes 
 (`train_block`), an evaluation that is due is left out (on several hosts it is done, as a process
 that stopped alone would keep the others waiting), `is_stopping` ends the loop, and `finish` saves
 the state, waits until it is written, and raises `TrainingStopped` with the command that resumes
-the run. A second signal ends the process at once (`interrupt.py`); what was saved before it stays.
+the run, also where the signal came as late as the last save. A second signal ends the process at
+once (`interrupt.py`); what was saved before it stays.
 An exception in a callback takes the way of a first signal, and is raised at its end; the callback
 is called no more.
 """
@@ -35,10 +36,10 @@ from bounce_mjx.learning.policy import Policy
 from bounce_mjx.learning.registry import find_algorithm, own_algorithm
 from bounce_mjx.physics.convergence import solver_warning
 from bounce_mjx.resources import VERSION
-from bounce_mjx.runs import checkpoints, folders
+from bounce_mjx.runs import checkpoints, creation, folders
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.progress import PATIENCE, Progress, are_solved
-from bounce_mjx.runs.storage import writable
+from bounce_mjx.runs.storage import lock_run, writable
 from bounce_mjx.training import events, faults, hosts
 from bounce_mjx.training.clock import Clock
 from bounce_mjx.training.evaluators import Evaluators
@@ -143,7 +144,7 @@ def open_job(
     )
     stack.push(job.remove_unstarted)
     if hosts.is_leader():
-        stack.enter_context(folders.lock_run(run))
+        stack.enter_context(lock_run(run))
     stack.callback(job.saver.wait)
     if resume is not None:
         job.read_state(resume)
@@ -255,8 +256,8 @@ class Job:
             # With one seed, what was trained after a checkpoint that the user named does not count
             # any more. A seed's own folder has its best policy alone.
             seed.recall_best(newest=checkpoint if seed.run == self.run else None)
-        counted = folders.stored_checkpoints(self.run)
-        self.saver.recall(x.number for x in counted if x.number <= checkpoint.number)
+        numbers = [stored.number for stored in folders.stored_checkpoints(self.run)]
+        self.saver.recall(number for number in numbers if number <= checkpoint.number)
         # Every process has read what the leader renames.
         hosts.wait_for_all()
         self.set_damaged_aside()
@@ -283,7 +284,7 @@ class Job:
         for folder, config in configs.items():
             with writable(folder, "make room there or make it writable"):
                 folder.mkdir(exist_ok=True)
-                folders.save_config(folder, config)
+                creation.save_config(folder, config)
 
     def introduce(self) -> None:
         """Says what is trained, where, and for how long."""
@@ -455,27 +456,29 @@ class Job:
           UserError: the state could not be saved.
           BaseException: what a callback raised.
         """
-        stopping = self.is_stopping()
-        where = ""
-        if self.is_finished() and not stopping:
-            self.say(self.why_it_ends())
+        is_early = self.is_stopping()
         # The policy of a warm start is saved once it is evaluated.
         has_nothing = self.is_new and self.steps == 0 and not self.is_evaluated()
-        if stopping and has_nothing:
+        if is_early and has_nothing:
             jax.distributed.shutdown()
             raise self.failure or Interrupted
+        if not is_early:
+            self.say(self.why_it_ends())
         if self.needs_save:
             self.save()
         self.end_last_save("the end of the training is lost")
-        if not stopping and not self.evaluate_best():
-            stopping = True
-            where = ", before the final evaluation"
+        where = ""
+        if not is_early:
+            is_measured = self.evaluate_best()
+            where = f", {'after' if is_measured else 'before'} the final evaluation"
+        # A signal may have come during the last save, too.
+        is_stopping = self.is_stopping()
         # Every process waits here for the others, of which none needs it any more.
         jax.distributed.shutdown()
         if self.failure is not None:
             self.say(f"a callback failed after {self.steps:,} steps; {self.continuing}")
             raise self.failure
-        if stopping:
+        if is_stopping:
             raise TrainingStopped(
                 f"stopped after {self.steps:,} steps{where}; {self.continuing}{self.report_so_far}"
             )
@@ -709,7 +712,7 @@ class Job:
 
 def _make_run(config: TrainConfig) -> Path:
     """The folder of a new run, which the leader makes."""
-    made = str(folders.create_run(config)) if hosts.is_leader() else None
+    made = str(creation.create_run(config)) if hosts.is_leader() else None
     return Path(hosts.exchange(made)[0])
 
 

@@ -8,7 +8,7 @@ import dataclasses
 import functools
 import shlex
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +29,7 @@ from bounce_mjx.interrupt import StopRequest, in_daemon_thread
 from bounce_mjx.reports.tables import details_line, results_table, seeds_table, unsolved_line
 from bounce_mjx.resources import POLICIES, policy_path
 from bounce_mjx.runs import folders
-from bounce_mjx.runs.checkpoints import read_actor
+from bounce_mjx.runs.checkpoints import read_actor, read_record
 from bounce_mjx.runs.config import TrainConfig, load_run_config
 from bounce_mjx.runs.layers import FLAGS, PYTHON, Layers, layers_on
 from bounce_mjx.runs.progress import load_results
@@ -47,15 +47,24 @@ class Run:
     those of the best one."""
 
     folder: Path
-    """The folder, or the name of a policy that comes with the package, such as robust."""
+    """The folder; a checkpoint in it, in place of the best one; or the name of a policy that comes
+    with the package, such as robust."""
 
     def __post_init__(self):
         object.__setattr__(self, "folder", policy_path(self.folder))
 
     @property
+    def _name(self) -> str:
+        """What a user calls it: a policy by its name, a run by its folder."""
+        for policy in POLICIES:
+            if policy_path(policy) == self.folder:
+                return policy
+        return str(self.folder)
+
+    @property
     def config(self) -> TrainConfig:
         """The run's config."""
-        return load_run_config(self.folder)
+        return load_run_config(folders.run_of(self.folder))
 
     @property
     def seeds(self) -> tuple["Run", ...]:
@@ -69,8 +78,12 @@ class Run:
 
     @property
     def results(self) -> Report | None:
-        """The results of the best checkpoint; None before the first evaluation."""
-        found = load_results(self.checkpoint.run)
+        """The results of the best checkpoint; None before the first evaluation. Those of another
+        checkpoint are of the evaluation after which it was saved, if there was one."""
+        checkpoint = self.checkpoint
+        if checkpoint != folders.best_checkpoint(checkpoint.run):
+            return read_record(checkpoint).report
+        found = load_results(checkpoint.run)
         return None if found is None else found.best
 
     @property
@@ -110,7 +123,7 @@ class Run:
           UserError: the environment has another task, arm, action, control step or observation than
             that of the policy's training.
         """
-        name = next((x for x in POLICIES if policy_path(x) == self.folder), str(self.folder))
+        name = self._name
         config = self.config.env
         advice = f"make the environment with policy={name!r}, or take Run({name!r}).env()"
         for found in environments_in(env):
@@ -186,20 +199,26 @@ def train(
     for name in ("task", "resume"):
         if name in settings:
             raise UserError(f"{name} is the first argument: train({str(settings[name])!r}, ...)")
+    if isinstance(start, TrainConfig):
+        raise UserError("the first argument is a config; give it by name: train(config=...)")
+    if isinstance(config, Mapping):
+        raise UserError("config is a mapping; give its keys as arguments: train(..., **config)")
     word = None if start is None else str(start)
     if isinstance(start, type):
         word = task_name(start)
-    whole = config if isinstance(config, TrainConfig) else None
+    whole: TrainConfig | None = None
     files: Sequence[str | Path] = ()
-    if isinstance(config, str | Path):
+    if isinstance(config, TrainConfig):
+        whole = config
+    elif isinstance(config, str | Path):
         files = (config,)
-    elif whole is None:
+    else:
         files = config
     of_start = {key: settings[key] for key in ("algorithm", "log_dir") if key in settings}
     of_start["warm_start"] = warm_start
-    begun = find_start(word, validate(StartFlags, of_start, PYTHON), whole)
-    given = {"config": files, "robot": robot, "world": world}
-    layers = layers_on(begun, validate(FileFlags, given, PYTHON), whole_config=whole)
+    beginning = find_start(word, validate(StartFlags, of_start, PYTHON), whole)
+    of_files = {"config": files, "robot": robot, "world": world}
+    layers = layers_on(beginning, validate(FileFlags, of_files, PYTHON))
     config = layers.config(settings)
     set_up_jax(config.env)
     console = stdout(quiet=quiet or not hosts.is_leader())
@@ -218,7 +237,7 @@ def run_training(
     Raises:
       UserError: as `job.train`.
     """
-    resume = layers.start.run
+    resume = layers.start.place
     if resume is None:
         say(console, f"config: {layers.title}")
     notes = notes_on_learning_rate(config) + notes_on_worlds(config) + notes_on_intervals(config)

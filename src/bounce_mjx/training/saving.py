@@ -149,16 +149,16 @@ class Saver:
             (seed,) = self._seeds
             is_best_kept = seed.saved is not None and not seed.has_unsaved_best
             best = {seed.saved.number} if is_best_kept else set()
-            return [self._save_of(0, snapshot, progress[0], training, self._earlier() | best)]
+            return [self._save_of(0, snapshot, progress[0], training, self._kept() | best)]
         saves = []
         for i, seed in enumerate(self._seeds):
             if seed.has_unsaved_best:
                 saves.append(self._save_of(i, snapshot, progress[i]))
         record = {"seeds": progress}
-        newest = Save(self._run, self._config, self._steps, training, record, kept=self._earlier())
+        newest = Save(self._run, self._config, self._steps, training, record, kept=self._kept())
         return [*saves, newest]
 
-    def _earlier(self) -> frozenset[int]:
+    def _kept(self) -> frozenset[int]:
         """The checkpoints that stay beside the one that is written next, by number."""
         count = self._config.keep_checkpoints
         if count == "all":

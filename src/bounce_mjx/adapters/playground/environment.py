@@ -18,8 +18,8 @@ from bounce_mjx.deploy.environments import (
     environment_config,
     refuse_warmup,
 )
-from bounce_mjx.env import env as core
 from bounce_mjx.env.env import Env, EnvState
+from bounce_mjx.env.env import State as CoreState
 from bounce_mjx.errors import UserError, needed
 from bounce_mjx.lazy import import_mjx
 from bounce_mjx.physics import PhysicsState
@@ -127,7 +127,7 @@ class PlaygroundTaskEnv(MjxEnv):
         """Advances one control step under the action [action_size]."""
         data = state.data
         physics = PhysicsState(data.qpos, data.qvel)
-        before = core.State(data.task._replace(physics=physics), **_common(state))
+        before = CoreState(data.task._replace(physics=physics), **_common(state))
         after = self.core.step(before, action)
         control, _ = self.core.control(before.pipeline_state, action)
         data = data.replace(
@@ -219,6 +219,6 @@ def make_env(
     return PlaygroundTaskEnv(env, config)
 
 
-def _common(state: State | core.State) -> dict[str, Any]:
+def _common(state: State | CoreState) -> dict[str, Any]:
     """The fields that Playground's states and this project's have in common."""
     return {name: getattr(state, name) for name in ("obs", "reward", "done", "metrics", "info")}
