@@ -313,7 +313,7 @@ def faults(joints: int, policy: str = "robust") -> dict[str, Fault]:
             ("joint_speed",),
         ),
     }
-    if metadata.ball_rests is not False:
+    if metadata.ball_rests:
         # A hand near the paddle, and one that takes the ball off it, are no faults there.
         found["ball: held 3 cm above"] = Fault(inject.held([0.0, 0.0, 0.05]), ("", *HELD), math.inf)
     return found

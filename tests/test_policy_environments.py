@@ -394,7 +394,7 @@ def test_an_exported_file_brings_the_whole_environment(tmp_path: Path, monkeypat
         assert interface_in(metadata) == interface_of(config.env), name
         again = type(config.env).model_validate(metadata.environment)
         assert again == config.env, name
-    with pytest.raises(UserError, match="an earlier version exported it"):
+    with pytest.raises(UserError, match="lacks environment; export the policy again"):
         environment_config(policy=_without_environment(tmp_path))
 
 

@@ -194,18 +194,13 @@ def _environment_in_file(path: Path, mjcf: Any) -> WorldConfig:
     """The environment in a policy's ONNX file.
 
     Raises:
-      UserError: the file is older, or its arm or its task is in a file that it does not hold.
+      UserError: its arm or its task is in a file that it does not hold.
     """
     # Needs onnxruntime.
     from bounce_mjx.deploy.loading import load_policy
 
     metadata = load_policy(path).metadata
     values = metadata.environment
-    if values is None:
-        raise UserError(
-            f"{path} says nothing of its environment, as an earlier version exported it; give the "
-            "run's folder or the name of the policy, or export it again"
-        )
     name = metadata.task
     if not is_task(name):
         raise not_imported(str(path), "task", name, None)

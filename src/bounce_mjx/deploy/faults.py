@@ -80,7 +80,7 @@ def arm_responses(metadata: Metadata) -> np.ndarray:
     latency = largest_term(metadata, "action_latency")
     stiffness = np.array(metadata.servo_stiffness)
     servo_damping = np.array(metadata.servo_damping)
-    joint_damping = np.array(metadata.joint_damping or np.zeros(len(stiffness)))
+    joint_damping = np.array(metadata.joint_damping)
     lag = max(float(np.max((servo_damping + joint_damping) / stiffness)), _NO_LAG)
     most_damping = (
         largest_term(metadata, "servo_damping", 1.0) * servo_damping
@@ -109,7 +109,7 @@ class Watch:
     def __init__(self, metadata: Metadata):
         """Bounds of a policy's worlds."""
         self._metadata = metadata
-        sag = max(metadata.sag, default=0.0) / least_term(metadata, "servo_gain", 1.0)
+        sag = max(metadata.sag) / least_term(metadata, "servo_gain", 1.0)
         # Where the weight and the servos' constant errors take a joint from its command, rad.
         self._beside_command = sag + largest_term(metadata, "servo_offset")
         # A robot's servo may have another zero than its encoder, unlike the training's.

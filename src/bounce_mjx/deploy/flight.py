@@ -102,7 +102,7 @@ def flight_bounds(metadata: Metadata) -> FlightBounds:
         noise=max(largest_term(metadata, "ball_position_noise"), _LEAST_NOISE),
         push=largest_term(metadata, "push_speed"),
         speed=metadata.ball.speed,
-        may_rest=metadata.ball_rests is not False,
+        may_rest=metadata.ball_rests,
         dt=metadata.control_dt,
     )
 

@@ -188,21 +188,16 @@ class Metadata(NamedTuple):
     """Centre of the paddle in the frame of the last hinge, m."""
     paddle_normal: Vector
     """Unit normal of the paddle's upper face in the frame of the last hinge."""
-    environment: dict[str, Any] | None = None
-    """Settings of the environment of the training, the `env` of its config; None in a file of an
-    earlier version."""
-    joint_damping: tuple[float, ...] = ()
-    """Torque of each joint's own damping per velocity, N m s/rad, which adds to the servo's; empty
-    in a file of an earlier version."""
-    sag: tuple[float, ...] = ()
-    """How far the arm's weight takes each joint off its command in the start pose, rad; empty in a
-    file of an earlier version."""
-    ball_rests: bool | None = None
-    """Whether the ball may rest on the paddle; None in a file of an earlier version, as if it
-    may."""
-    ball_thrown: bool | None = None
-    """Whether the ball is thrown at the arm, and does not start over the paddle; None in a file of
-    an earlier version."""
+    environment: dict[str, Any]
+    """Settings of the environment of the training, the `env` of its config."""
+    joint_damping: tuple[float, ...]
+    """Torque of each joint's own damping per velocity, N m s/rad, which adds to the servo's."""
+    sag: tuple[float, ...]
+    """How far the arm's weight takes each joint off its command in the start pose, rad."""
+    ball_rests: bool
+    """Whether the ball may rest on the paddle."""
+    ball_thrown: bool
+    """Whether the ball is thrown at the arm, and does not start over the paddle."""
 
 
 def measurement_sizes(metadata: Metadata) -> dict[str, int]:
@@ -250,12 +245,10 @@ def from_entries(entries: dict[str, str]) -> Metadata:
         file_format = json.loads(entries["format"])
         if file_format != FORMAT:
             raise ValueError(f"its format is {file_format}, not {FORMAT}; export the policy again")
-    later = Metadata._field_defaults
-    missing = [name for name in Metadata._fields if name not in entries and name not in later]
+    missing = [name for name in Metadata._fields if name not in entries]
     if missing:
-        raise ValueError(f"its metadata lacks {missing[0]}")
-    stored = [name for name in Metadata._fields if name in entries]
-    values = later | {name: _with_tuples(json.loads(entries[name])) for name in stored}
+        raise ValueError(f"its metadata lacks {missing[0]}; export the policy again")
+    values = {name: _with_tuples(json.loads(entries[name])) for name in Metadata._fields}
     limits = values["limits"]
     goals = values["goals"]
     groups = {
@@ -277,7 +270,7 @@ def in_driver_order(metadata: Metadata, names: Sequence[str], order: Sequence[in
     """
 
     def ordered(values: Sequence[Any]) -> tuple[Any, ...]:
-        return tuple(values[i] for i in order) if values else ()
+        return tuple(values[i] for i in order)
 
     limits = metadata.limits
     if limits is not None:

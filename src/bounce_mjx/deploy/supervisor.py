@@ -582,7 +582,7 @@ class Supervisor:
                 f"the newest picture of the ball is {1e3 * age:.0f} ms old, and an episode starts "
                 f"with one of at most {1e3 * self._max_picture_age:.0f} ms; check the camera"
             )
-        if progress.balls is None or self._metadata.ball_thrown is not False:
+        if progress.balls is None or self._metadata.ball_thrown:
             return
         paddle = paddle_position(self._metadata, progress.resting_angles)
         x, y, z = progress.balls[0] - paddle
