@@ -159,7 +159,7 @@ def swapped(lines: list[str]) -> list[str]:
             r"are 1e\+04 s apart, .+ if the times are microseconds, write time \[us\]",
         ),
         (scaled("time", 1e9), r"are 1e\+07 s apart, .+ write time \[ns\]"),
-        (scaled("time", -1.0), r"119 of the 120 joint angles .+ row 3 has a time out of order"),
+        (scaled("time", -1.0), r"times of the joint angles .+ at row 3 first; sort the log by its"),
         (scaled("ball_position", 1000.0), r"the ball .+ write ball_position\.x \[mm\]"),
         (lambda lines: [lines[0].replace("left", "a"), *lines[1:]], "angles.a, .+ --joint-names"),
         (
@@ -941,7 +941,7 @@ def test_a_file_of_several_recordings_is_split_where_its_time_restarts(tmp_path:
 
 
 def test_remedies_say_what_to_write(tmp_path: Path) -> None:
-    """For decimal commas between commas, one foreign title, a missing encoder, a whole turn."""
+    """For decimal commas between commas, one foreign title, a missing encoder."""
     log, path = sound_log(3.0), tmp_path / "log.csv"
     good = arm_csv(tmp_path / "good.csv", log.times, log.joint_angles, log.servo_targets)
     text = good.read_text()
@@ -966,10 +966,27 @@ def test_remedies_say_what_to_write(tmp_path: Path) -> None:
     path.write_text("\n".join([",".join(titles), *cells]))
     with pytest.raises(UserError, match="number 3 of each row of the joint angles"):
         read_csv(path, ARM)
-    turned = log._replace(joint_angles=log.joint_angles + [0, 0, 0, 2 * np.pi, 0, 0])
-    ranges = np.tile([-2.0, 2.0], (6, 1))
-    with pytest.raises(UserError, match=r"1 whole turn off: subtract 6\.28319 rad from its angles"):
-        check(turned, ARM, ranges)
+
+
+@pytest.mark.parametrize(
+    "angles, targets, remedy",
+    [
+        (1, 0, r"a whole turn: subtract 6\.28319 rad from joint_angles\.Joint4$"),
+        (0, -2, r"2 whole turns: add 12\.5664 rad to servo_targets\.Joint4$"),
+        (1, 1, r"subtract 6\.28319 rad from joint_angles\.Joint4 and servo_targets\.Joint4$"),
+    ],
+)
+def test_a_whole_turn_is_taken_from_the_columns_that_have_it(
+    angles: int, targets: int, remedy: str
+) -> None:
+    log = sound_log(3.0)
+    turn = np.eye(6)[3] * 2.0 * np.pi
+    turned = log._replace(
+        joint_angles=log.joint_angles + angles * turn,
+        servo_targets=log.servo_targets + targets * turn,
+    )
+    with pytest.raises(UserError, match=remedy):
+        check(turned, ARM, np.tile([-2.0, 2.0], (6, 1)))
 
 
 def test_an_excitation_needs_no_more_torque_than_the_servos_have() -> None:

@@ -45,7 +45,7 @@ from bounce_mjx.identify.windows import Windows, is_seen
 # the rest of the delay that are a lag; the others' gains, and the shares of the delay that are
 # theirs.
 _OWN_LAG_SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
-_GAINS = (1.0, 2.0, 4.0, 8.0, 30.0)
+_GAINS = (0.3, 1.0, 2.0, 4.0, 8.0, 30.0)
 _SERVO_SHARES = (0.1, 0.3, 0.6, 0.9)
 _LAG_SHARES = (0.0, 0.3, 0.6)
 # Gains and longest own delays (s) of the servos of an arm that follows its commands exactly; and
@@ -291,9 +291,14 @@ def _late_servos(layout: Layout, servos: Servos, delay: float) -> np.ndarray:
     for gain, servo_share, lag_share in itertools.product(_GAINS, _SERVO_SHARES, _LAG_SHARES):
         damping = servos.damping_for(servo_share * total, gain, ARM["servo_damping"].limits)
         # The joints' own damping may make them later than that share.
-        rest = max(total - float(np.mean(servos.delays(gain, damping))), 0.0)
+        rest = total - float(np.mean(servos.delays(gain, damping)))
         # A share of what the servo was to leave.
-        lag = min(lag_share * (1.0 - servo_share) * total, rest)
+        lag = lag_share * (1.0 - servo_share) * total
+        if rest < lag and gain < max(_GAINS):
+            # Servos so soft would be later than measured.
+            continue
+        rest = max(rest, 0.0)
+        lag = min(lag, rest)
         world = {
             "servo_gain": np.full(layout.num_joints, gain),
             "servo_damping": damping,

@@ -14,7 +14,7 @@ from scipy.optimize import linear_sum_assignment
 
 from bounce_mjx.identify.flight import GRAVITY
 from bounce_mjx.identify.following import SETTLING, find_settled
-from bounce_mjx.identify.log import Log, find_gaps
+from bounce_mjx.identify.log import Log, find_gaps, turns_off
 from bounce_mjx.identify.response import (
     EARLY,
     FOLLOWS,
@@ -368,7 +368,8 @@ def _offset_rule(which: str) -> Callable[[_Case, int], Facts | None]:
         if _offset(case, j) != which:
             return None
         offset = case.response.joints[j].offset
-        return {"offset": offset, "turns": round(offset / _TURN)}
+        column = f"joint_angles.{case.response.joints[j].name}"
+        return {"offset": offset, "turns": turns_off(round(offset / _TURN), column)}
 
     return test
 
@@ -597,7 +598,7 @@ RULES = (
     ),
     Rule(
         "zero", True, "joint", _offset_rule("turns"),
-        "its angle is {turns} whole turns from its command; subtract them",
+        "its angle is away from its command by {turns}",
     ),
     Rule(
         "one way", False, "joint", _offset_rule("one way"),

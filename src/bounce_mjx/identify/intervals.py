@@ -1,5 +1,6 @@
 """What a log says about the unknowns: estimates from resampled windows."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +16,10 @@ _BLOCK = 2
 _LARGEST_LEVERAGE = 0.9
 # |J1 - J2| / |J1 + J2| of a window's two derivatives beyond which it has none.
 _DISAGREEMENT = 0.1
+# Error of an angle that is alike in all windows, as a share of its noise.
+_ALIKE = 0.05
+# What pictures say nothing about, as angles show it many times as well.
+_OF_ANGLES = ("delay", "delay_variance", "servo_gain", "servo_damping")
 
 
 class Certainty(NamedTuple):
@@ -49,6 +54,16 @@ def certainty(
     window's information, Q the prior's (`Layout.precision`), x - m the distance from the prior's
     mean, and e a draw of the prior: what no window shows has the prior's spread. What the model
     lacks is in the residuals r_s, and so in the spread.
+
+    *What angles show alone.* Servos move a bounce by less than the step in which it begins, so that
+    derivatives of the pictures by a gain, a damping or a delay are noise, to which thousands of
+    angles would be fitted: pictures say nothing about these (a cut, Plummer 2015, "Cuts in Bayesian
+    graphical models").
+
+    *What no log averages out.* Errors that are alike in all windows, as of an encoder's scale, a
+    gear's play, or a clock, do not become less with more rows. They may be a twentieth of an
+    angle's noise, and look like the effect of friction, of stiffness or of a delay; and a simulated
+    servo answers anywhere within a physics step (`_alike`).
 
     *What friction hides.* A servo rests anywhere within its dead band, friction / stiffness, and
     what differs between a joint's directions, or its motions, moves it there in all windows alike:
@@ -86,6 +101,8 @@ def certainty(
         linearise(problem, vector, fit.starts, np.arange(size), entries, weights, step)
         for step, weights in sides
     ]
+    for line in lines:
+        _cut(line, layout, problem.windows.angles[0].size)
     ones = _mean(lines[:2])
     twos = _mean(lines[2:])
     twos = [np.where(has_ball[:, None, None], b, a) for a, b in zip(ones, twos, strict=True)]
@@ -106,6 +123,9 @@ def certainty(
     random = np.random.default_rng(0)
     prior = layout.precision
     changes = resample(informations, gradients, is_estimated, random, prior) * scale
+    # What is left of the prior's variance.
+    room = np.sqrt(np.maximum(scale**2 - np.var(changes, axis=0), 0.0)) * is_estimated
+    changes += _alike(problem, fit, ones[0], room, random)
     offsets = changes[:, layout.slices["servo_offset"]]
     offsets += random.uniform(-1.0, 1.0, offsets.shape) * dead_band
     information = _positive(np.sum(informations, axis=0))
@@ -117,6 +137,63 @@ def _mean(lines: list[Linearisation]) -> tuple[np.ndarray, np.ndarray]:
     forward, backward = lines
     by_unknown = 0.5 * (forward.by_unknown + backward.by_unknown)
     return by_unknown, 0.5 * (forward.by_state + backward.by_state)
+
+
+def _cut(line: Linearisation, layout: Layout, num_angles: int) -> None:
+    """Takes what angles alone show out of the derivatives of the pictures."""
+    for name in _OF_ANGLES:
+        line.by_unknown[:, num_angles:, layout.slices[name]] = 0.0
+
+
+def _alike(
+    problem: Problem,
+    fit: Fit,
+    by_unknown: np.ndarray,
+    room: np.ndarray,
+    random: np.random.Generator,
+) -> np.ndarray:
+    """Changes [B, P] of the estimate by errors of the angles that are alike in all windows.
+
+    An error of `_ALIKE` noises (root mean square) passes for the effect of a joint's friction, of
+    its stiffness, with as late a servo, or of the delay of all joints. So each is known no better
+    than the change whose effect is as large. Where several angles count as one, as their errors are
+    alike, it is so much larger.
+
+    Args:
+      by_unknown: derivatives [S, M, P] of the white residuals.
+      room: largest deviation [P] of these changes.
+    """
+    layout = problem.layout
+    windows = problem.windows
+    shape = windows.angles.shape
+    effects = by_unknown[:, : windows.angles[0].size].reshape(*shape, -1)
+    counts = windows.split(fit.weights)[0] > 0.0
+    numbers = np.maximum(np.sum(counts, axis=(0, 1)), 1)
+    joints = np.arange(layout.num_joints)
+    every = np.arange(len(fit.vector))
+    changes = np.zeros((_RESAMPLES, len(fit.vector)))
+
+    def sizes(columns: Sequence[np.ndarray]) -> np.ndarray:
+        """Root mean square [n] of what the unknowns in columns [n] together change in each joint,
+        in units of the noise."""
+        along = sum(effects[:, :, joints, column] for column in columns)
+        return np.sqrt(np.sum((along * counts) ** 2, axis=(0, 1)) / numbers)
+
+    def hide(places: Sequence[np.ndarray], spread: np.ndarray) -> None:
+        """Changes the unknowns at these places together."""
+        spread = np.minimum(spread, np.min(room[np.array(places)], axis=0))
+        draws = spread * random.normal(size=(_RESAMPLES, len(spread)))
+        for place in places:
+            changes[:, place] += draws
+
+    for names in (("joint_frictionloss",), ("servo_gain", "servo_damping")):
+        places = [every[layout.slices[name]] for name in names]
+        hide(places, _ALIKE / np.maximum(sizes(places), 1e-12))
+    for name, least in (("delay_variance", 0.0), ("delay", layout.physics_dt / np.sqrt(12.0))):
+        place = every[layout.slices[name]]
+        size = np.mean(sizes([np.repeat(place, len(joints))]), keepdims=True)
+        hide([place], np.hypot(_ALIKE / np.maximum(size, 1e-12), least))
+    return changes
 
 
 def resample(

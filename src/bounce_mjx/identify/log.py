@@ -22,6 +22,8 @@ _MIN_ROWS = 100
 _WRONG_ROWS = 0.05
 # Times that go back so often are those of several recordings in one file.
 _MOST_RESTARTS = 30
+# Share of the rows whose time goes back from which the log runs backwards.
+_BACKWARDS = 0.9
 # Time without a row, s and in typical steps, on whose other side are times of another clock.
 _FAR_IN_TIME = 3600.0
 _FAR_STEPS = 100.0
@@ -248,6 +250,11 @@ def _in_order(rows: Rows, notes: list[str]) -> Rows:
     # A time that is too late makes all that follow early, and one too early all before it late.
     wrong = min(early, late, key=np.sum)
     restarts = np.flatnonzero(np.diff(rows.times) < 0.0)
+    if len(restarts) > _BACKWARDS * len(rows.times):
+        raise UserError(
+            f"the times of the {rows.name} go back in nearly every row, at "
+            f"{rows.place.format(rows.numbers[restarts[0] + 1])} first; sort the log by its time"
+        )
     if np.sum(wrong) >= max(_WRONG_ROWS * len(wrong), 2.0) and len(restarts) <= _MOST_RESTARTS:
         place = rows.place.format(rows.numbers[restarts[0] + 1])
         more = f" and {len(restarts) - 1} more times" if len(restarts) > 1 else ""
@@ -486,6 +493,28 @@ def least_age(log: Log) -> float:
     return max(0.0, float(np.quantile(log.arrivals - log.picture_times, 0.02)))
 
 
+def turns_off(turns: int, column: str) -> str:
+    """By how many whole turns a column is off, and what to do, for a reader."""
+    count = "a whole turn" if abs(turns) == 1 else f"{abs(turns)} whole turns"
+    change = f"{abs(turns) * _TURN:.6g} rad"
+    if turns > 0:
+        return f"{count}: subtract {change} from {column}"
+    return f"{count}: add {change} to {column}"
+
+
+def _whole_turns(values: np.ndarray, middle: float, within: tuple[float, float]) -> int:
+    """By how many whole turns a joint's values [T] are off; 0 if it is no turn that takes them out
+    of their limits, rad.
+
+    Args:
+      middle: of the joint's range, rad.
+      within: limits, rad.
+    """
+    turns = round((float(np.median(values)) - middle) / _TURN)
+    turned = values - turns * _TURN
+    return turns if np.all((turned > within[0]) & (turned < within[1])) else 0
+
+
 def check(log: Log, joint_names: Sequence[str], joint_ranges: np.ndarray) -> None:
     """Checks that a log can be the robot's.
 
@@ -498,6 +527,7 @@ def check(log: Log, joint_names: Sequence[str], joint_ranges: np.ndarray) -> Non
     limited = joint_ranges[:, :1] < joint_ranges[:, 1:]
     ends = np.array([-1.0, 1.0])
     low, high = np.where(limited, joint_ranges + _BEYOND_RANGE * ends, _LARGEST_ANGLE * ends).T
+    columns = {"joint_angles": log.joint_angles, "servo_targets": log.servo_targets}
     for name, times, values in (
         ("joint angles", log.times, log.joint_angles),
         ("servo targets", log.target_times, log.servo_targets),
@@ -510,13 +540,17 @@ def check(log: Log, joint_names: Sequence[str], joint_ranges: np.ndarray) -> Non
             row, joint = np.argwhere(outside)[0]
             column = f"{name.replace(' ', '_')}.{joint_names[joint]}"
             remedy = f"if these are degrees, write {column} [deg]"
-            turns = round(float(np.median(values[:, joint]) - np.mean(joint_ranges[joint])) / _TURN)
-            turned = values[:, joint] - turns * _TURN
-            if limited[joint] and turns and np.all((turned > low[joint]) & (turned < high[joint])):
-                remedy = (
-                    f"it is {turns} whole turn{'s' if abs(turns) > 1 else ''} off: subtract "
-                    f"{turns * _TURN:.6g} rad from its angles and targets"
-                )
+            if limited[joint]:
+                middle = float(np.mean(joint_ranges[joint]))
+                within = low[joint], high[joint]
+                turns = _whole_turns(values[:, joint], middle, within)
+                turned = [
+                    f"{title}.{joint_names[joint]}"
+                    for title, each in columns.items()
+                    if turns and _whole_turns(each[:, joint], middle, within) == turns
+                ]
+                if turned:
+                    remedy = f"it is off by {turns_off(turns, ' and '.join(turned))}"
             raise UserError(
                 f"{column} in {log.source} is {values[row, joint]:.4g} rad at the time "
                 f"{times[row]:.6g} s, and {low[joint]:.3g} to {high[joint]:.3g} rad is expected; "
