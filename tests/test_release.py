@@ -81,7 +81,7 @@ def test_an_installed_release_trains_evaluates_exports_and_acts(
     call("uv", "venv", "--quiet", "--python", version, tmp_path / "env", folder=tmp_path)
     bin_folder = next(p for p in (tmp_path / "env/bin", tmp_path / "env/Scripts") if p.exists())
     python, command = bin_folder / "python", bin_folder / "bounce-mjx"
-    file = f"bounce_mjx[deploy,export,video] @ {built.as_uri()}"
+    file = f"bounce_mjx[deploy,video] @ {built.as_uri()}"
     call("uv", "pip", "install", "--quiet", "--python", python, file, folder=tmp_path)
 
     work, other = tmp_path / "work", tmp_path / "other"

@@ -85,7 +85,7 @@ def export_onnx(checkpoint: Checkpoint) -> bytes:
       UserError: the checkpoint is damaged, its arm or its task cannot be exported, or onnx is not
         installed.
     """
-    with needed("onnx", "bounce_mjx[export]"):
+    with needed("onnx", "bounce_mjx[deploy]"):
         import onnx
     config = load_run_config(checkpoint.run)
     checkpoint, policy, _ = read_actor(checkpoint, config)

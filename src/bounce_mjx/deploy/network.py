@@ -53,7 +53,7 @@ class OnnxNetwork:
 
     def __init__(self, model: bytes):
         """Loads an ONNX file; any exception means that it is not a policy."""
-        with needed("onnxruntime", "onnxruntime"):
+        with needed("onnxruntime", "bounce_mjx[deploy]"):
             import onnxruntime
         options = onnxruntime.SessionOptions()
         # The network is too small to share between threads.
