@@ -41,7 +41,7 @@ MISTAKES = (
     ("train --num-envs abc", "--num-envs is abc", "integer"),
     (
         "train --hidden-layers x y",
-        "must be a valid integer, unable to parse string as an integer (",
+        "--hidden-layers is x, but must be a valid integer (",
     ),
     # Also printed, since training refuses it.
     (
@@ -91,7 +91,12 @@ MISTAKES = (
     ("train --warm-start robust_smal", "did you mean robust_small?"),
     ("train latst", "there is no task, policy or run latst; did you mean latest?"),
     ("eval --import", "--import needs a file or a module"),
-    ("eval --import no.py", "no.py cannot be read (", "give --import FILE.py"),
+    ("eval --import no.py", "no.py cannot be read (No such file or directory); give --import"),
+    (
+        "train --reward.height.weight three",
+        "--reward.height.weight is three, but must be a valid number (",
+    ),
+    ("train --target-height-range 0.5", "target_height_range: 0.5 is not a range; give two"),
     ("eval pretrained --robot ur5e", "give mirror"),
     ("eval pretrained --log-dir typo", "--log-dir is where the newest run is looked for, and pret"),
     ("robustness mirror --log-dir typo", "and mirror is named; omit one of them"),

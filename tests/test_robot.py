@@ -556,8 +556,8 @@ def test_adopt_prints_each_servo_and_each_change_of_the_world(tmp_path, capsys) 
     for name, stiffness, damping in zip(
         ARM_JOINTS.split(), robot.servo_stiffness, robot.servo_damping, strict=True
     ):
-        numbers = f"kp {stiffness:.4g}, kv {damping:.4g}, force limit 100"
-        assert re.search(rf"  {name}: .* rad, inertia .*, {re.escape(numbers)}\n", said)
+        numbers = f"kp {stiffness:.4g} N m/rad, kv {damping:.4g} N m s/rad, force limit 100 N m"
+        assert re.search(rf"  {name}: .* rad, inertia .* kg m², {re.escape(numbers)}\n", said)
     assert "gravity [0.0, 0.0, -1.6], wind [1.0, 0.0, 0.0], density 1.2" in said
     assert "the disabled damper, the disabled actuator groups" in said
 

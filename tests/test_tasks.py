@@ -941,6 +941,8 @@ def test_a_config_file_cannot_name_code(mine: Path, tmp_path: Path) -> None:
         read_preset(path)
     import_code(mine)
     assert read_preset(path, task="dribble").env.apex_range == (0.06, 0.07)
+    with pytest.raises(UserError, match="run straight; give .*, dribble, .*--import FILE.py"):
+        settings_of(["straight"])
 
 
 @pytest.mark.parametrize(

@@ -215,13 +215,16 @@ def describe(adoption: "Adoption") -> list[str]:
     for name, position, inertia, servo in zip(
         names, positions, pose.inertia, adoption.servos, strict=True
     ):
-        unit = "m" if name in slides else "rad"
+        is_slide = name in slides
+        unit = "m" if is_slide else "rad"
+        force = "N" if is_slide else "N m"
         limit = "no force limit"
         if servo.force_limit is not None:
-            limit = f"force limit {servo.force_limit:.4g}"
+            limit = f"force limit {servo.force_limit:.4g} {force}"
         lines.append(
-            f"  {name}: {position:+.3f} {unit}, inertia {inertia:.3g}, kp {servo.stiffness:.4g}, "
-            f"kv {servo.damping:.4g}, {limit}"
+            f"  {name}: {position:+.3f} {unit}, inertia {inertia:.3g} "
+            f"{'kg' if is_slide else 'kg m²'}, kp {servo.stiffness:.4g} {force}/{unit}, "
+            f"kv {servo.damping:.4g} {force} s/{unit}, {limit}"
         )
     if slides:
         lines.append(

@@ -57,7 +57,9 @@ HOLLOW = 2.0 / 3.0
 
 def _check_pair(ends: Any) -> Any:
     if not isinstance(ends, list | tuple) or len(ends) != 2:
-        raise ValueError(f"{shorten(str(ends))} is not a range; give two numbers")
+        is_one_word = isinstance(ends, list) and len(ends) == 1 and isinstance(ends[0], str)
+        words = ends[0] if is_one_word else str(ends)
+        raise ValueError(f"{shorten(words)} is not a range; give two numbers")
     return ends
 
 

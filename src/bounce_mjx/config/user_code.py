@@ -63,7 +63,7 @@ def import_code(place: str | os.PathLike) -> None:
         content = path.read_bytes()
     except OSError as error:
         raise UserError(
-            f"{shorten(str(path))} cannot be read ({reason_of(error)}); give {_FLAG} FILE.py"
+            f"{shorten(str(path))} cannot be read ({error.strerror}); give {_FLAG} FILE.py"
         ) from error
     if all(content != code_file.content for code_file in _code_files.values()):
         _run(CodeFile(path, content))

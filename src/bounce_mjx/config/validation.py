@@ -80,6 +80,8 @@ def describe(
         reason = "an item is missing"
     if first["type"] == "path_type":
         reason = "must be a path"
+    # Of a word in a number's place.
+    reason = reason.partition(", unable to parse")[0]
     if first["type"].startswith(("greater_than", "less_than")) and key in fields:
         reason += f" {unit_of(fields[key].description or '')}".rstrip()
     for other in error.errors()[1:]:

@@ -71,6 +71,14 @@ _OFF_FLOOR = 0.03
 _SAMPLES_OF_A_LINK = 12
 # Largest distance of the paddle from a shape that is measured, m.
 _FAR = 0.5
+# The quaternion of a handle along z in four turns about it by 90 degrees.
+_HALF = math.sqrt(0.5)
+_TURNS = (
+    (_HALF, 0.0, -_HALF, 0.0),
+    (0.5, 0.5, -0.5, 0.5),
+    (0.0, _HALF, 0.0, _HALF),
+    (-0.5, 0.5, 0.5, 0.5),
+)
 
 
 class PaddlePose(NamedTuple):
@@ -99,13 +107,9 @@ class PaddlePose(NamedTuple):
 def mounts(paddle: PaddleConfig) -> list[PaddleConfig]:
     """The paddle held by a handle along the site's z, in four turns about it, and flat on the
     site."""
-    half = math.sqrt(0.5)
     flat_on_site = {"position": (0.0, 0.0, 0.03), "quaternion": (1.0, 0.0, 0.0, 0.0)}
     choices = []
-    for turn in range(4):
-        cosine = math.cos(turn * math.pi / 4.0)
-        sine = math.sin(turn * math.pi / 4.0)
-        quaternion = (half * cosine, half * sine, -half * cosine, half * sine)
+    for quaternion in _TURNS:
         on_handle = {"position": (0.0, 0.0, 0.19), "quaternion": quaternion}
         choices.append(paddle.model_copy(update=on_handle))
     choices.append(paddle.model_copy(update=flat_on_site))

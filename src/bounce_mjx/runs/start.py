@@ -9,7 +9,7 @@ from pydantic.fields import FieldInfo
 
 from bounce_mjx.config.command_line import Flag
 from bounce_mjx.config.settings import StrictModel
-from bounce_mjx.config.user_code import not_imported, own_name
+from bounce_mjx.config.user_code import not_imported, own_name, own_names
 from bounce_mjx.errors import UserError, shorten, suggest
 from bounce_mjx.learning.config import PPO_NAME, PPOConfig
 from bounce_mjx.learning.registry import find_algorithm, own_algorithm
@@ -127,7 +127,7 @@ def find_start(word: str | None, flags: StartFlags, whole: TrainConfig | None = 
     if os.path.isfile(word):
         flag = "--import" if word.endswith(".py") else "--config"
         raise UserError(f"{word} is a file, and no task, policy or run; give {flag} {word}")
-    known = list(dict.fromkeys((*registered_tasks(), *POLICIES)))
+    known = list(dict.fromkeys((*registered_tasks(), *own_names(Task), *POLICIES)))
     own = "a run's folder, or --import FILE.py for a task of your own"
     advice = suggest(word, [*known, LATEST]) or f"give {', '.join(known)}, {own}"
     raise UserError(f"there is no task, policy or run {shorten(word)}; {advice}")

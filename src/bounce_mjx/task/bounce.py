@@ -220,6 +220,7 @@ class Bounce(task.Task):
             "episode/bounces_at_end", "n_bounces", "episodes", "bounces in a row at its end"
         ),
         task.Curve("task/apex_error", "apex_error", "bounced", "|apex − target height|, cm", 100.0),
+        task.Curve("task/apex_offset", "apex_offset", "bounced", "apex − target height, cm", 100.0),
         task.Curve("task/ball_xy_error", "ball_xy_error"),
         task.Curve("task/bounces_so_far", "n_bounces"),
     )
