@@ -15,7 +15,7 @@ SETTLING_SECONDS = 1.0
 
 
 class LeftOfLine(task.RewardTerm):
-    """Left of the line: minus how far the paddle is right of it, and a margin before it."""
+    """0 if the paddle is left of the line by the margin, else minus what is missing."""
 
     weight: float = 2.0
     """Weight of the term."""

@@ -83,3 +83,25 @@ def test_an_encoder_that_is_frozen_at_rest_is_noticed_when_the_joint_is_moved(po
         # The reason says what happened.
         words = f"{metadata.joint_names[joint]} does not follow its commands: its angle went over 0"
         assert words in str(fault)
+
+
+@pytest.mark.parametrize("sag, stops", [(0.004, False), (0.0, True)])
+def test_an_arm_that_is_loaded_by_its_own_motion_is_followed(sag: float, stops: bool) -> None:
+    """A joint that the arm's weight takes 4 mrad off its command goes nearly 4 mrad up and down
+    when the arm accelerates by g either way, while its own command rests."""
+    metadata = load_policy("pretrained").metadata
+    metadata = metadata._replace(sag=(sag,) * 6)
+    home = np.array(metadata.default_joint_angles)
+    watch = Watch(metadata)
+    followed = watch.rest(home, home)
+    rng = np.random.default_rng(0)
+    faults = []
+    for step in range(100):
+        angles = home + 1e-4 * rng.standard_normal(6)
+        angles[2] += 0.0038 * math.sin(0.3 * step)
+        try:
+            followed = watch.follow(followed, angles, home.copy())
+        except Fault as fault:
+            faults.append(fault)
+            break
+    assert bool(faults) == stops

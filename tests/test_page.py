@@ -213,7 +213,7 @@ def test_a_paused_page_shows_the_values_that_hold(page, mirrored: Simulation) ->
     client, did = page
     client.press("pause")
     wait_until(lambda: stands_still(did))
-    height, sampled = client.control("height, m"), client.control("sampled at each reset")
+    height, sampled = client.control("height, m"), client.control("sampled")
     client.set(height, 0.8)
     client.values.clear()
     client.set(sampled, True)

@@ -124,7 +124,7 @@ def test_the_commands_of_the_tutorial_run(
             # An untrained policy passes no result.
             assert end.code in (0, 1), capsys.readouterr().err
         ran.append(name)
-    assert ran == ["view", "train", "eval", "train", "plot", "play", "export", "rehearse"]
+    assert ran == ["view", "train", "eval", "play", "export", "rehearse", "train", "plot"]
     assert "left of the line" in trained
     for file in ("view.html", "line.mp4", "line.onnx"):
         assert (tmp_path / file).stat().st_size > 1000

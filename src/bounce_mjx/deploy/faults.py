@@ -17,10 +17,14 @@ _APART = 0.01
 _LATER = 0.02
 _NO_LAG = 1e-9
 # Motion beside all these arms that is too much: a share of what the commands moved meanwhile, a
-# share of `action_scale`, the encoders' noise in standard deviations, and a count of the encoder.
+# share of `action_scale` or what the arm's own inertia does, the encoders' noise in standard
+# deviations, and a count of the encoder.
 # In 32 episodes of each of four policies, at most 0.65 of it was beside the nearest arm.
 _OF_COMMANDS = 0.25
 _OF_SCALE = {"target": 0.2, "measured": 0.05}
+# Parts of an arm that accelerate by g load its servos as its weight does. From weightless to twice
+# the weight, a joint moves over two of its sags.
+_OF_SAG = 2.0
 _OF_NOISE = 3.0
 # The same for a joint whose reading repeats to the last digit all the time: what dry friction
 # holds, rad, and counts of the encoder.
@@ -109,14 +113,17 @@ class Watch:
     def __init__(self, metadata: Metadata):
         """Bounds of a policy's worlds."""
         self._metadata = metadata
-        sag = max(metadata.sag) / least_term(metadata, "servo_gain", 1.0)
+        sag = np.array(metadata.sag) / least_term(metadata, "servo_gain", 1.0)
         # Where the weight and the servos' constant errors take a joint from its command, rad.
-        self._beside_command = sag + largest_term(metadata, "servo_offset")
+        self._beside_command = float(np.max(sag)) + largest_term(metadata, "servo_offset")
         # A robot's servo may have another zero than its encoder, unlike the training's.
         self.offset = _SAG + largest_term(metadata, "encoder_bias") + self._beside_command
         """Distance of a resting joint from its command, rad."""
         noise = largest_term(metadata, "joint_angle_noise")
-        self._least = _OF_SCALE[metadata.action_base] * metadata.action_scale + _OF_NOISE * noise
+        of_scale = _OF_SCALE[metadata.action_base] * metadata.action_scale
+        of_noise = _OF_NOISE * noise
+        self._in_motion = np.maximum(of_scale, _OF_SAG * sag) + of_noise
+        self._after_rest = np.maximum(of_scale + self._beside_command, _OF_SAG * sag) + of_noise
         # The weights of the last commands, the newest last.
         self._arms = np.ascontiguousarray(arm_responses(metadata)[:, ::-1])
         self._compared = math.ceil(_COMPARED / metadata.control_dt)
@@ -190,22 +197,25 @@ class Watch:
             )
         moved = np.ptp(followed.angles[:, joint])
         commanded = np.ptp(followed.commands[:, joint])
+        unlike_motion = (high - low)[nearest, joint]
+        allowed = self._allowed_motion(followed)[joint]
         raise Fault(
             "joint_astray",
-            f"{name}: its angle went over {moved:.2g} rad in {_COMPARED:g} s, and its commands "
-            f"over {commanded:.2g} rad",
+            f"{name}: its angle went over {moved:.2g} rad in {_COMPARED:g} s, its commands over "
+            f"{commanded:.2g} rad, and it moved {unlike_motion:.2g} rad beside any arm of the "
+            f"training, which may be {allowed:.2g} rad",
         )
 
     def _allowed_motion(self, followed: Followed) -> np.ndarray:
         """Motion of each joint beside the training's arms [J] that is no fault, rad: that of the
-        policy and its noise, a count of the encoder, a share of what the commands moved, and after
-        a rest where weight and servos take the joint; of a reading that repeats all the time, what
-        dry friction and its counts hide at most."""
+        policy or of the arm's inertia, with its noise, a count of the encoder, a share of what the
+        commands moved, and after a rest where weight and servos take the joint; of a reading that
+        repeats all the time, what dry friction and its counts hide at most."""
         of_count = np.minimum(followed.smallest_change, RESOLUTION)
         of_commands = _OF_COMMANDS * np.ptp(followed.commands, axis=0)
         is_settling = followed.steps < self._settling
-        of_rest = self._beside_command if is_settling else 0.0
-        moving = self._least + of_count + of_commands + of_rest
+        least = self._after_rest if is_settling else self._in_motion
+        moving = least + of_count + of_commands
         # A moving joint's reading changes by a count, and one with noise in every step.
         repeating = np.minimum(moving, _HELD + _COUNTS * followed.smallest_change)
         return np.where(followed.repeats >= self._compared, repeating, moving)

@@ -23,6 +23,8 @@ _STEPS_PER_KEY = 5
 # Decimals that a page keeps.
 _DECIMALS = 6
 _SAMPLED = "sampled at each reset"
+# Also between resets, as a task may have it.
+_GOAL_SAMPLED = "sampled"
 
 
 class _Setting:
@@ -131,7 +133,7 @@ class Controls:
         # The folder has the whole name, as the panel is narrow.
         short = label.split()[-1] + (f", {goal.unit}" if goal.unit else "")
         with gui.add_folder(label):
-            sampled = gui.add_checkbox(_SAMPLED, given is None, visible=not self._is_film)
+            sampled = gui.add_checkbox(_GOAL_SAMPLED, given is None, visible=not self._is_film)
             if goal.names:
                 handle = gui.add_dropdown(short, goal.names, disabled=self._is_film)
             else:
