@@ -32,7 +32,7 @@ from bounce_mjx.evaluation.episodes import begin, reset_episodes, run_until
 from bounce_mjx.evaluation.suite import Condition, load_suite
 from bounce_mjx.learning.policy import Actor, Policy
 from bounce_mjx.runs.checkpoints import read_actor
-from bounce_mjx.runs.worlds import env_in_world
+from bounce_mjx.runs.worlds import settings_in_world
 from bounce_mjx.training.setup import set_up_jax
 from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import TERMS, RandomizationConfig
@@ -67,7 +67,7 @@ def main() -> None:
         for name in command.policies:
             (checkpoint,) = command.choose(name, robot=command.robot)
             config = command.config_of(checkpoint, command.robot)
-            world = None if command.world is None else env_in_world(config.env, command.world)
+            world = None if command.world is None else settings_in_world(config.env, command.world)
             suite = Path(__file__).with_name("endless.yaml")
             conditions = load_suite(suite, config.env, world)
             if world is not None:

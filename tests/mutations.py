@@ -167,7 +167,7 @@ FAULTS = [
     ("a training ends a block too early", "training/job.py",
      "self.steps >= self.config.total_steps", "self.steps + self.steps_per_block >= self.config.total_steps", "test_job.py -k whole_block_nearest"),
     ("results end a training that was not to stop", "training/job.py",
-     "return self.config.stop_when_solved and solved", "return solved", "test_job.py -k results_have_a_margin"),
+     "return self.config.stop_when_solved and are_over", "return are_over", "test_job.py -k results_have_a_margin"),
     ("a policy that was not saved stays the best", "training/seeds.py",
      "        if has_failed:\n", "        if False:\n", "test_job.py -k could_not_be_saved"),
     ("a resumed training forgets its best policy", "training/seeds.py",

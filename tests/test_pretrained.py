@@ -26,7 +26,7 @@ from bounce_mjx.runs.folders import (
     is_users_run,
 )
 from bounce_mjx.runs.layers import read_preset
-from bounce_mjx.runs.worlds import env_in_world
+from bounce_mjx.runs.worlds import settings_in_world
 from bounce_mjx.task.registry import find_task
 from tiny_runs import settings_of
 
@@ -44,7 +44,7 @@ def measured(name: str, episodes: int, world: str | None = None) -> Report:
     checkpoint = find_checkpoint(name)
     config = load_run_config(checkpoint.run)
     if world:
-        config = config.model_copy(update={"env": env_in_world(config.env, world)})
+        config = config.model_copy(update={"env": settings_in_world(config.env, world)})
     policy, options = read_policy(checkpoint, config), EvaluationOptions(episodes)
     return evaluate_policy(policy, config.env, networks_of(config.ppo), options).report
 

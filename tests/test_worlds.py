@@ -23,9 +23,9 @@ from bounce_mjx.runs.folders import find_checkpoint
 from bounce_mjx.runs.layers import read_layers, read_preset
 from bounce_mjx.runs.start import Choice
 from bounce_mjx.runs.worlds import (
-    env_in_world,
     read_named_world,
     robot_in_world,
+    settings_in_world,
 )
 from bounce_mjx.task.bounce import Bounce
 from bounce_mjx.task.catch import Catch
@@ -119,7 +119,7 @@ def test_a_world_with_ranges_of_axes_trains_and_is_doubled(tmp_path: Path) -> No
     given = settings_of(["--world", str(world), "--randomization.paddle-tilt", "-0.1", "0.1"])
     assert given.config.env.randomization.paddle_tilt == (-0.1, 0.1)
     trained = TrainConfig()
-    there = env_in_world(trained.env, world)
+    there = settings_in_world(trained.env, world)
     _, named = read_named_world(world)
     conditions = load_suite(
         resource_path("configs/robustness.yaml"),
@@ -135,7 +135,7 @@ def test_a_world_with_ranges_of_axes_trains_and_is_doubled(tmp_path: Path) -> No
 
 def test_assumed_numbers_are_doubled_entry_by_entry() -> None:
     """As `bounce-mjx robustness --world` doubles them: about the model's value of each entry."""
-    there = env_in_world(TrainConfig().env, Path("fast_servo"))
+    there = settings_in_world(TrainConfig().env, Path("fast_servo"))
     _, named = read_named_world(Path("fast_servo"))
     nominals = model_nominals(there)
     doubled = named.double_assumed(nominals)
@@ -225,7 +225,7 @@ def test_a_robots_own_balls_and_stiff_contact_are_taken_by_another_task(tmp_path
 
 def test_a_policy_is_measured_in_the_world_alone() -> None:
     trained = read_preset(Path("transfer"))
-    there = env_in_world(trained.env, Path("fast_servo"))
+    there = settings_in_world(trained.env, Path("fast_servo"))
     _, named = read_named_world(Path("fast_servo"))
     drawn = there.randomization
     assert set(drawn.terms) == set(named.settings["randomization"])
@@ -233,7 +233,7 @@ def test_a_policy_is_measured_in_the_world_alone() -> None:
     assert there.observation == trained.env.observation
     assert there.action_scale == trained.env.action_scale
     with pytest.raises(UserError, match="fast_servo"):
-        env_in_world(trained.env, Path("ur5e_rtde"))
+        settings_in_world(trained.env, Path("ur5e_rtde"))
 
 
 def test_a_warm_start_is_in_the_world_in_which_its_policy_is_measured() -> None:
@@ -242,7 +242,7 @@ def test_a_warm_start_is_in_the_world_in_which_its_policy_is_measured() -> None:
     for world in (None, "fast_servo"):
         choice = Choice(word="robust_small", world=None if world is None else Path(world))
         begun = read_layers(choice, resource_path("configs/cpu.yaml")).config().env
-        assert begun == env_in_world(trained, world)
+        assert begun == settings_in_world(trained, world)
 
 
 def test_a_robots_file_is_of_no_other_algorithm_or_warm_start(tmp_path: Path) -> None:
@@ -258,24 +258,24 @@ def test_a_world_of_a_robot_brings_its_limits_to_a_policy() -> None:
     own = trained.env.robot.limits
     free = {"robot": trained.env.robot.model_copy(update={"limits": LimitsConfig()})}
     config = trained.model_copy(update={"env": trained.env.model_copy(update=free)})
-    there = env_in_world(config.env, Path("ur5e_rtde"))
+    there = settings_in_world(config.env, Path("ur5e_rtde"))
     assert own.velocity is not None and there.robot.limits == own
     assert there.action_scale == trained.env.action_scale
     assert there.randomization.action_latency == (0.015, 0.045)
     measured = free | {"action": ActionConfig(base="measured")}
     config = trained.model_copy(update={"env": trained.env.model_copy(update=measured)})
     with pytest.raises(UserError, match="ur5e_rtde.*action.base"):
-        env_in_world(config.env, Path("ur5e_rtde"))
+        settings_in_world(config.env, Path("ur5e_rtde"))
 
 
 def test_a_named_world_is_for_a_ball_on_the_paddle_too() -> None:
     """How well a person drops a ball is nothing to one that lies on the paddle."""
     for task, ball_start in (("balance", None), ("catch", (-0.03, 0.03))):
-        config = env_in_world(find_task(task), "fast_servo")
+        config = settings_in_world(find_task(task), "fast_servo")
         Env(config)
         assert config.randomization.ball_start == ball_start
         assert config.randomization.action_latency is not None
-        trained = env_in_world(find_task(task).Config(), "fast_servo")
+        trained = settings_in_world(find_task(task).Config(), "fast_servo")
         assert trained.randomization.ball_start == ball_start
 
 
@@ -291,9 +291,9 @@ def test_how_often_a_task_samples_its_goals_is_no_part_of_a_world() -> None:
     trained = _Moving.Config(randomization={"goal_interval": (3.0, 3.0), "air_drag": (0.0, 0.1)})
     drag = RandomizationConfig(air_drag=(0.1, 0.1))
     others = [
-        env_in_world(trained, "nominal"),
-        env_in_world(trained, "fast_servo"),
-        env_in_world(trained, drag),
+        settings_in_world(trained, "nominal"),
+        settings_in_world(trained, "fast_servo"),
+        settings_in_world(trained, drag),
         environment_config(trained, "nominal"),
         setup_of(trained, EvaluationOptions(nominal=True)).env.config,
     ]
@@ -304,7 +304,7 @@ def test_how_often_a_task_samples_its_goals_is_no_part_of_a_world() -> None:
     assert others[1].randomization.action_latency and not others[0].randomization.air_drag
     # The user's own interval of a training is no part of the task, as its ranges are not.
     bounce = Bounce.Config(randomization={"goal_interval": (3.0, 3.0)})
-    assert env_in_world(bounce, "nominal").randomization.goal_interval is None
+    assert settings_in_world(bounce, "nominal").randomization.goal_interval is None
     # One value for all goals leaves nothing to sample again.
     fixed = EvaluationOptions(nominal=True, goals={"target_height": 0.5})
     assert setup_of(trained, fixed).env.config.randomization.goal_interval is None

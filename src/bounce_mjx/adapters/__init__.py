@@ -1,5 +1,6 @@
 """The environment with the interfaces of other libraries. A class wraps an `Env`, which
-`bounce_mjx.environment` makes, and has it as `core`; or it wraps another class of these, as said:
+`bounce_mjx.environment` makes (`deploy/environments.py`), and has it as `core`; or it wraps another
+class of these, as said:
 
 | library | class | in |
 |---|---|---|
@@ -11,6 +12,9 @@
 | brax, and TorchRL through it | `BraxTaskEnv` | `brax/environment.py` |
 | MuJoCo Playground | `PlaygroundTaskEnv` | `playground/environment.py` |
 | gymnax, PureJaxRL | `GymnaxTaskEnv`, `PureJaxRLTaskEnv` | `gymnax_env.py` |
+
+`Run.policy_in` acts in any of these with a policy, also below wrappers; it finds the `Env` by
+`core`, and by the names that libraries give to what they wrap (`deploy/wrappers.py`).
 
 What belongs to a library that need not be installed is imported from its own file.
 """

@@ -136,12 +136,12 @@ def known_arm(model: "mujoco.MjModel", config: WorldConfig) -> str | None:
     """The name in configs/robots/ of an arm with the same lengths and axes; None if there is none,
     or the package with its file is not installed."""
     from bounce_mjx.robot.likeness import are_alike
-    from bounce_mjx.runs.worlds import AS_TRAINED, env_in_world
+    from bounce_mjx.runs.worlds import AS_TRAINED, settings_in_world
     from bounce_mjx.world.model import world_model
 
     for file in sorted(resource_path(ROBOTS).glob("*.yaml")):
         try:
-            known = env_in_world(config.task, AS_TRAINED, file)
+            known = settings_in_world(config.task, AS_TRAINED, file)
             if known.num_joints == config.num_joints and are_alike(
                 world_model(known, visual=False), model
             ):

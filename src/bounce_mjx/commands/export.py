@@ -9,7 +9,7 @@ from bounce_mjx.config.command_line import Flag, parse
 
 
 class ExportCommand(WhichPolicy):
-    """Exports a trained policy as an ONNX file."""
+    """Exports a trained policy, with the environment of its training, as an ONNX file."""
 
     checkpoint: Annotated[Path | None, Flag(metavar="[CHECKPOINT]", is_positional=True)] = None
     """A run's folder (its best checkpoint), a checkpoint in it, latest for the newest run, or a

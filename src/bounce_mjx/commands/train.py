@@ -128,7 +128,7 @@ def read_command(args: Sequence[str]) -> TrainCommand:
     given = read_flags(fields, words, prog=PROG, description=ABOUT, defaults={})
     late_word = given.get("word")
     if late_word != word:
-        # Refuses what is none, such as a second value of a flag.
+        # First refuses a word that is no start at all, such as a second value of a flag.
         find_start(late_word, first)
         raise UserError(
             f"{late_word} is what the training begins with; give it first: {PROG} {late_word} ..."
@@ -151,7 +151,7 @@ def _print_help(fields: Mapping[str, FieldInfo], config: TrainConfig, is_short: 
     defaults = flat(TrainFlags().model_dump()) | flat(config.model_dump())
     options = {}
     if is_short:
-        epilog = "--help-all lists every flag; each key of the config is one."
+        epilog = "--help-all lists every flag: each key of the config is one, without env. and ppo."
         options = {"shown": _SHORT_HELP, "epilog": epilog}
     # Prints, and exits.
     read_flags(fields, ["--help"], prog=PROG, description=ABOUT, defaults=defaults, **options)
@@ -169,8 +169,8 @@ def main(args: Sequence[str]) -> None:
 
 
 def _for_devices(command: TrainCommand, settings: Settings) -> Settings:
-    """The settings with the preset for JAX's devices, which this starts, where there is a plugin
-    and no device for it."""
+    """The settings, read again with the preset for JAX's devices, which this starts, where a plugin
+    is installed and JAX finds no device for it."""
     return settings if has_plugin() == has_accelerator() else command.settings()
 
 
@@ -232,7 +232,8 @@ def train(command: TrainCommand, settings: Settings) -> None:
             run = run_training(layers, config, console, callbacks, flags.report)
         except TrainingStopped as stop:
             say(console, str(stop))
-            # Does not wait for a compilation or an evaluation in another thread.
+            # The stop was asked for, and the state is saved. Does not wait for a compilation or an
+            # evaluation in another thread.
             leave(0)
         words = shlex.join([str(run.checkpoint.run), *imports_of(config)])
         say(console, f"measure it: bounce-mjx eval {words}")

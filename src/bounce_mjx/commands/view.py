@@ -35,8 +35,8 @@ def main(args: Sequence[str]) -> None:
     # The task and the robot, read first, decide which flags of the environment there are. The
     # second reading gives the command's own flags again, and they are left out.
     command = parse(ViewCommand, args, prog=PROG, is_first=True)
-    preset = Choice(word=command.task, config=(Path("default"),), robot=command.robot)
-    layers = read_layers(preset)
+    choice = Choice(word=command.task, config=(Path("default"),), robot=command.robot)
+    layers = read_layers(choice)
     of_env = {key: field for key, field in layers.fields.items() if key.startswith("env.")}
     fields = fields_in(ViewCommand) | of_env
     names = flag_names(fields)

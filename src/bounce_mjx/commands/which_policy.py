@@ -15,7 +15,7 @@ from bounce_mjx.resources import policy_folder
 from bounce_mjx.runs.config import TrainConfig, load_run_config, runs_folder
 from bounce_mjx.runs.layers import read_preset
 from bounce_mjx.runs.presets import named_file
-from bounce_mjx.runs.worlds import AS_TRAINED, World, env_in_world, read_named_world
+from bounce_mjx.runs.worlds import AS_TRAINED, World, read_named_world, settings_in_world
 from bounce_mjx.task.registry import DEFAULT, find_task
 from bounce_mjx.world.randomization import RandomizationConfig
 
@@ -99,7 +99,7 @@ def suite_conditions(
     path = named_file(suite, "configs")
     if world is None:
         return path, load_suite(path, config.env), 0
-    there = env_in_world(config.env, world)
+    there = settings_in_world(config.env, world)
     _, named = read_named_world(world)
     assumed = named.double_assumed(model_nominals(there))
     return path, load_suite(path, config.env, there, assumed), len(assumed)
@@ -203,7 +203,7 @@ class WhichPolicy(StrictModel):
           robot: of the mirror law.
 
         Raises:
-          UserError: as `load_run_config`, `read_preset` and `env_in_world`.
+          UserError: as `load_run_config`, `read_preset` and `settings_in_world`.
         """
         from bounce_mjx.baselines.mirror import observing
         from bounce_mjx.runs.folders import MIRROR_LAW
@@ -214,4 +214,4 @@ class WhichPolicy(StrictModel):
         else:
             config = load_run_config(checkpoint.run)
             env = config.env
-        return config.model_copy(update={"env": env_in_world(env, world)})
+        return config.model_copy(update={"env": settings_in_world(env, world)})

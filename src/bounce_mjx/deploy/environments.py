@@ -1,5 +1,5 @@
-"""An environment is made once: of a task, of a policy or of a run, in a world (`env_in_world`),
-with settings on top. Every adapter takes the `Env` that `environment` gives.
+"""An environment is made once: of a task, of a policy or of a run, in a world
+(`settings_in_world`), with settings on top. Every adapter takes the `Env` that `environment` gives.
 
 It is among the exported policies because an .onnx file is a policy with its environment, too.
 """
@@ -21,7 +21,7 @@ from bounce_mjx.resources import POLICIES, policy_path
 from bounce_mjx.robot.config import is_packaged
 from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.folders import run_of
-from bounce_mjx.runs.worlds import NOMINAL, env_in_world
+from bounce_mjx.runs.worlds import NOMINAL, settings_in_world
 from bounce_mjx.task.registry import (
     DEFAULT,
     find_task,
@@ -95,9 +95,9 @@ def environment_config(
             raise UserError("a config and a policy both say the environment; give one of them")
         return _of_policy(policy, start, world, _path(robot), settings)
     if isinstance(start, WorldConfig):
-        return with_settings(env_in_world(start, world, _path(robot)), settings)
+        return with_settings(settings_in_world(start, world, _path(robot)), settings)
     task = find_task(start or DEFAULT) if isinstance(start or DEFAULT, str) else start
-    return with_settings(env_in_world(task, world, _path(robot)), settings)
+    return with_settings(settings_in_world(task, world, _path(robot)), settings)
 
 
 def with_settings(config: WorldConfig, settings: Mapping[str, Any]) -> WorldConfig:
@@ -180,7 +180,7 @@ def _of_policy(
             f"the policy {policy} is of the task {name_of_policy}, and the environment of the task "
             f"{name}; leave one of them out"
         )
-    config = with_settings(env_in_world(trained, world or NOMINAL, robot), settings)
+    config = with_settings(settings_in_world(trained, world or NOMINAL, robot), settings)
     check_interface(
         interface_of(trained),
         interface_of(config),

@@ -71,7 +71,8 @@ class TrainConfig(StrictModel):
     env: pydantic.SerializeAsAny[WorldConfig] = Field(default_factory=_default_env)
     """The world and the task: the settings of the task's `Config`."""
     algorithm: str = PPO_NAME
-    """ppo, or the name of an imported subclass of `bounce_mjx.learning.ppo.PPO`."""
+    """ppo, or the name of an imported subclass of `bounce_mjx.learning.ppo.PPO` or
+    `bounce_mjx.learning.algorithm.Algorithm`."""
     ppo: pydantic.SerializeAsAny[PPOConfig] = PPOConfig()
     """The settings of the algorithm, those of its `Config`, also of one that is no PPO."""
     seed: NonNegativeInt = 0
@@ -103,9 +104,9 @@ class TrainConfig(StrictModel):
     eval_seed: EvalSeed = 10_000
     """Seed of the evaluations during training; not that of `bounce-mjx eval`."""
     stop_when_solved: bool = False
-    """End once an evaluation meets all results with a margin. Then 64 other episodes should meet
-    them too. It ends at the latest with the evaluation after 1.5 times the steps of the first
-    one, after step 0, that meets all."""
+    """End once an evaluation meets all results with a margin, so clearly that 64 other episodes
+    should meet them too (they are not run). Where no margin comes, end with the evaluation after
+    1.5 times the steps of the first one, after step 0, that meets all."""
     warm_start: Path | None = None
     """Run, or policy of the package, from whose networks and environment the training starts."""
     log_dir: Path = Field(default_factory=_default_log_dir)

@@ -12,7 +12,7 @@ a run's folder, or of a seed's, which looks like one (`training.run.Run` reads i
         robustness.*, failures.png      of the commands `robustness` and `eval --failures`
         checkpoints/<number>/           the newest states, as many as keep_checkpoints says, and
                                         the best evaluation
-            policy/                     the policy's arrays
+            policy/                     the policy's arrays; not in a run's own of several seeds
             training/                   the training state's arrays; optional
             networks/                   both networks, for another training; optional
             record/                     the steps, the config, the evaluations so far and its own

@@ -340,13 +340,13 @@ class Layers:
         if self.start.resumed is None or "total_steps" not in user.values:
             return []
         from bounce_mjx.runs.folders import latest_checkpoint, run_of
-        from bounce_mjx.runs.progress import Progress, are_solved
+        from bounce_mjx.runs.progress import Progress, waits_are_over
         from bounce_mjx.runs.records import verify
 
         checkpoint = latest_checkpoint(run_of(self.start.place), self.start.place)
         progress = verify(checkpoint).progress
         seeds = [Progress.model_validate(seed) for seed in progress.get("seeds", [progress])]
-        if are_solved(seeds):
+        if waits_are_over(seeds):
             return [Layer(user.source, {"stop_when_solved": False})]
         return []
 
@@ -391,8 +391,7 @@ def _merge(layers: Sequence[Layer]) -> tuple[dict[str, Any], dict[str, str]]:
             randomization = without_idle_curriculum(values["env"]["randomization"])
             values["env"] = values["env"] | {"randomization": randomization}
         for key in flat(layer.values):
-            # Put last, as the last source among a mapping's keys is the mapping's
-            # (`TrainConfig.sources`).
+            # Put last: `TrainConfig.sources` gives a mapping the source of its last key.
             sources.pop(key, None)
             sources[key] = layer.source
     # A later layer may end a value, or replace a mapping by None.

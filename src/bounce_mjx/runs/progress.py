@@ -25,14 +25,14 @@ class Progress(pydantic.BaseModel):
     training diverged."""
     best_steps: int = 0
     solved_steps: int | None = None
-    """Steps at the first evaluation that met all results: the end of the time "to all five
-    results" in every measurement."""
+    """Steps at the first evaluation that met all results, with a margin or without: the end of the
+    time "to all five results" (of bounce) in every measurement."""
     solved_seconds: float | None = None
     """Seconds from the setup of this training, or of its last resumption, to the end of that
     evaluation."""
     margin_steps: int | None = None
     """Steps at the first evaluation that met all with a margin
-    (`Report.passed_with_margin`)."""
+    (`Report.passed_with_margin`; its size is in `task/results.py`)."""
     evaluations: list[dict[str, Any]] = []
     """Of each, the value of each result by its name, its `steps`, whether a full evaluation
     `passed`, and whether it ended with the `screening`, as the policy could not be the best."""
@@ -91,9 +91,9 @@ class Progress(pydantic.BaseModel):
         return True
 
 
-def are_solved(seeds: Sequence[Progress]) -> bool:
-    """Whether `stop_when_solved` ends the training of these seeds. Those that have diverged do not
-    count."""
+def waits_are_over(seeds: Sequence[Progress]) -> bool:
+    """Whether `stop_when_solved` ends the training of these seeds: of each, a margin has come,
+    or the wait for it is over. Those that have diverged do not count."""
     return all(seed.wait_is_over for seed in seeds if seed.fault is None)
 
 

@@ -65,9 +65,10 @@ class Choice(ChoiceFlags):
     ] = None
     """First word: a task (bounce by default, balance, catch, juggle, track, or one of yours, which
     --import FILE.py names), trained from the start; a policy that comes with the package, such as
-    robust_small, from whose networks a training starts, in its environment; or a run's folder,
-    latest for the newest run, or a checkpoint in it, which continues in place. Of a resumed run,
-    flags may change only total-steps, eval-every, save-every, keep-checkpoints, eval-episodes,
+    robust_small, from whose networks a training starts, in its environment; or a run's folder, a
+    checkpoint in one, or latest for the newest run of bounce or of --log-dir, which continues in
+    place. A word that is a task and a policy, such as catch, is the task. Of a resumed run, flags
+    may change only total-steps, eval-every, save-every, keep-checkpoints, eval-episodes,
     screening-episodes, eval-seed, stop-when-solved and num-devices."""
 
 
@@ -102,7 +103,9 @@ class Start(NamedTuple):
 
 
 def find_start(word: str | None, flags: StartFlags, whole: TrainConfig | None = None) -> Start:
-    """What the first word means: a task, a policy or a run; and what is said beside it.
+    """What the first word means: a task, a policy or a run; and what is said beside it. A word that
+    is a task and more is the task; a folder of a policy's name wins over the policy of the package
+    (`resources.policy_folder`).
 
     Args:
       word: None for the default task, or that of a whole config or a warm start.

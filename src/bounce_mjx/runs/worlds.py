@@ -1,6 +1,7 @@
-"""The environment of a task, or of a policy's training, in a world: `env_in_world`.
+"""The settings of the environment of a task, or of a policy's training, in a world:
+`settings_in_world`; `deploy.environments.environment` makes the `Env`.
 
-Its settings are layers (`Layer`), the lowest first: what the policy was trained in, its robot, and
+They are layers (`Layer`), the lowest first: what the policy was trained in, its robot, and
 its world (`layers_of_environment`). A training has further layers between them (`runs/layers.py`).
 """
 
@@ -20,7 +21,8 @@ from bounce_mjx.world.named import CURRICULUM, NamedWorld, read_world
 from bounce_mjx.world.randomization import RandomizationConfig
 
 AS_TRAINED = None
-"""World: each that a policy's training sampled, as it did; of a task, that of its defaults."""
+"""World: each that a policy's training sampled, as it did; of a task, that of its defaults. Of a
+policy, `environment` and `Run.env` take `NOMINAL` where no world is given."""
 TRAINING = "training"
 """World: each that a policy's training sampled, without its curriculum."""
 NOMINAL = "nominal"
@@ -57,12 +59,13 @@ class EnvironmentLayers(NamedTuple):
     """A named world."""
 
 
-def env_in_world(
+def settings_in_world(
     start: type[Task] | WorldConfig, world: World, robot: Path | None = None
 ) -> WorldConfig:
-    """The environment of a task, or of a policy's training with its observation and its actions, in
-    a world. Each caller says the world: what measures a policy is `AS_TRAINED` unless the
-    user names another one; the environment that a user asks for by its policy is `NOMINAL`.
+    """The settings of the environment of a task, or of a policy's training with its observation and
+    its actions, in a world. Each caller says the world that it takes unless the user names one:
+    what measures a policy `AS_TRAINED`, the rehearsal of one `TRAINING`, and the environment that a
+    user asks for by its policy `NOMINAL`.
 
     Args:
       start: a task, or the config of a policy's environment.

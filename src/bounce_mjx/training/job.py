@@ -6,8 +6,9 @@ From a signal to its checkpoint: `StopRequest` notes the signal, the block goes 
 (`train_block`), an evaluation that is due is left out (on several hosts it is done, as a process
 that stopped alone would keep the others waiting), `is_stopping` ends the loop, and `finish` saves
 the state, waits until it is written, and raises `TrainingStopped` with the command that resumes
-the run, also where the signal came as late as the last save. A second signal ends the process at
-once (`interrupt.py`); what was saved before it stays.
+the run, also where the signal came as late as the last save. A later Ctrl-C or SIGTERM does what it
+did before the training: in a command, it ends the process at once (`StopRequest`). What was saved
+before it stays.
 An exception in a callback takes the way of a first signal, and is raised at its end; the callback
 is called no more.
 """
@@ -38,7 +39,7 @@ from bounce_mjx.physics.convergence import solver_warning
 from bounce_mjx.resources import VERSION
 from bounce_mjx.runs import checkpoints, creation, folders
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.runs.progress import PATIENCE, Progress, are_solved
+from bounce_mjx.runs.progress import PATIENCE, Progress, waits_are_over
 from bounce_mjx.runs.storage import lock_run, writable
 from bounce_mjx.training import events, faults, hosts
 from bounce_mjx.training.clock import Clock
@@ -81,7 +82,7 @@ def train(
         failed, the training diverged, or its final state could not be saved.
       TrainingStopped: SIGINT, SIGTERM or SIGHUP came; the state is saved.
       Interrupted: the signal came before the first block, or before the policy of a warm start was
-        evaluated; a new run's folder is removed.
+        evaluated; a new run's folder is removed, and a command exits with 130.
     """
     hosts.agree(config, resume)
     with contextlib.ExitStack() as stack:
@@ -154,8 +155,8 @@ def open_job(
 
 
 def make_trainer(config: TrainConfig, env: Env) -> Trainer:
-    """What trains with the algorithm of a config: its own trainer, or `PPOTrainer` for `PPO` and
-    what extends it, which is below this package and so names none.
+    """What trains with the algorithm of a config (`learning.algorithm.Algorithm`): its own trainer,
+    or `PPOTrainer` where it returns None. `PPO` does, as `learning` may not import `training`.
 
     Raises:
       UserError: the config does not fit it.
@@ -262,7 +263,7 @@ class Job:
         hosts.wait_for_all()
         self.set_damaged_aside()
         if self.is_finished():
-            met = "has met all results" if self.is_solved() else "has been trained to its end"
+            met = "has met all results" if self.ends_by_results() else "has been trained to its end"
             self.say(f"{self.run} {met}, {self.steps:,} steps; add --total-steps N to train on")
 
     def set_damaged_aside(self) -> None:
@@ -395,12 +396,13 @@ class Job:
         self.clock.lap("save")
 
     def is_stopping(self) -> bool:
-        """Whether a signal has come to any process, or a callback has failed."""
+        """Whether a signal has come to any process, or a callback has failed. On several hosts,
+        every process must call this at the same point."""
         return hosts.any_of(self.stop.requested or self.failure is not None)
 
     def is_finished(self) -> bool:
         """Whether the training ends here: at its last step, by a callback, or by its results."""
-        return self.is_at_its_end() or self.is_solved()
+        return self.is_at_its_end() or self.ends_by_results()
 
     def train_block(self) -> tuple[BlockMetrics, float]:
         """Trains for a block of I iterations; its metrics, each [S, I], and its duration, s.
@@ -448,7 +450,8 @@ class Job:
         self.clock.lap("train")
 
     def finish(self) -> None:
-        """Waits until everything is saved, and evaluates the best policy on fresh resets.
+        """Saves what is new, waits until it is written, and evaluates the best policy on fresh
+        resets.
 
         Raises:
           TrainingStopped: a stop was requested.
@@ -473,7 +476,7 @@ class Job:
             where = f", {'after' if is_measured else 'before'} the final evaluation"
         # A signal may have come during the last save, too.
         is_stopping = self.is_stopping()
-        # Every process waits here for the others, of which none needs it any more.
+        # Every process waits here for the others; after this, none needs another.
         jax.distributed.shutdown()
         if self.failure is not None:
             self.say(f"a callback failed after {self.steps:,} steps; {self.continuing}")
@@ -537,16 +540,16 @@ class Job:
         """Whether the last step is reached, or a callback has ended the training."""
         return self.callback_has_ended or self.steps >= self.config.total_steps
 
-    def is_solved(self) -> bool:
-        """Whether the results end the training."""
-        solved = are_solved([seed.progress for seed in self.seeds])
-        return self.config.stop_when_solved and solved
+    def ends_by_results(self) -> bool:
+        """Whether the results end the training (`stop_when_solved`)."""
+        are_over = waits_are_over([seed.progress for seed in self.seeds])
+        return self.config.stop_when_solved and are_over
 
     def why_it_ends(self) -> str:
         """Why the training ends here, in words."""
         if self.callback_has_ended and self.steps < self.config.total_steps:
             return f"a callback ended the training after {self.steps:,} steps; {self.continuing}"
-        if not self.is_solved():
+        if not self.ends_by_results():
             return f"the training ends after its {self.steps:,} steps (total_steps)"
         if all(seed.progress.margin_steps is not None for seed in self.healthy()):
             return "the training ends: all results are met with a margin (stop_when_solved)"
@@ -632,7 +635,8 @@ class Job:
         """The result of what is computed before the first block.
 
         Raises:
-          Interrupted: a stop was requested meanwhile.
+          Interrupted: a stop was requested meanwhile; of several hosts in this process alone, whose
+            end then ends the others (`hosts.join`).
         """
         if not self.stop.wait_for(future):
             raise Interrupted

@@ -121,7 +121,8 @@ class Run:
 
         Raises:
           UserError: the environment has another task, arm, action, control step or observation than
-            that of the policy's training.
+            that of the policy's training, is in another process, or is in a wrapper that is not
+            known to leave these as they are (`deploy/wrappers.py`).
         """
         name = self._name
         config = self.config.env

@@ -44,8 +44,8 @@ class SeedRun:
 
     @property
     def has_unsaved_best(self) -> bool:
-        """True from an evaluation of the current policy that is the best one to the end of its
-        save, which starts before the training goes on."""
+        """Whether the best policy is not saved yet. It is the current policy then, as its save
+        starts before the training goes on."""
         return self.best is not self.saved
 
     def add_report(self, report: Report, policy: Policy, steps: int, seconds: float) -> None:

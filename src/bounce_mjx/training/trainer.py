@@ -22,7 +22,7 @@ class Snapshot(NamedTuple):
     """Everything that is needed to continue the training; numbers of at most 32 bits."""
     networks: list[dict[str, Any]] | None = None
     """What another training can start with, for each seed: "params" and "statistics" of both
-    networks."""
+    networks; None for an algorithm without these two, such as SAC."""
 
 
 class Trainer(Protocol):
@@ -52,7 +52,8 @@ class Trainer(Protocol):
 
         Args:
           networks: those of an earlier training, which each seed starts with, and the statistics of
-            their inputs (`checkpoints.read_warm_start`); not with a state.
+            their inputs (`checkpoints.read_warm_start`); not with a state. Always None for an
+            algorithm that does not make PPO's networks, to which a warm start is refused.
         """
 
     def train_block(self) -> BlockMetrics:

@@ -1,5 +1,6 @@
 """For brax's PPO: the project's tuned settings, the policies that it saved, and a function that its
-trainers miss on a newer JAX."""
+trainers miss on a newer JAX. brax's PPO trains in its own loop, outside `training.job`, and
+its policies are no runs."""
 
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
