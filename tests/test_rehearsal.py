@@ -274,12 +274,16 @@ def test_a_search_begins_at_the_model_itself() -> None:
 @pytest.mark.parametrize(
     "words, error",
     [
-        (["robust", "--fault", "stuk:3"], "there is no fault stuk; did you mean stuck?"),
+        (
+            ["robust", "--fault", "stuk:3"],
+            "there is no fault stuk; did you mean stuck? give one of stuck, ",
+        ),
         (["robust", "--fault", "stuck"], "the fault stuck needs one of the joints 1 to 6 (Joint1"),
         (["robust", "--fault", "camera:1"], "the fault camera is not of a joint; give camera"),
         (["robust", "--motion", "x.csv"], "--motion is for an arm without a policy; leave it out"),
         (["a.yaml", "--robot", "ur5e"], "a.yaml and --robot ur5e are two arms; give one"),
-        (["robust", "--film", "day.mpeg"], "--film day.mpeg must end with .mp4, .webp, .gif"),
+        (["robust", "--film", "day.mpeg"], "--film day.mpeg does not end in .mp4 or .webp or .gif"),
+        (["robust", "--film", "no/day.mp4"], "the folder of --film no/day.mp4 does not exist"),
     ],
 )
 def test_a_mistake_is_one_sentence(words, error, capsys) -> None:

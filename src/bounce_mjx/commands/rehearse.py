@@ -71,7 +71,7 @@ def main(args: Sequence[str]) -> None:
     """Runs the command line; exits with 1 if the arm stopped without a fault, and with 2 on a
     mistake."""
     command, given_goals = parse_with_goals(RehearseCommand, args, prog=_PROG)
-    _check_film(command)
+    _check_files(command)
     is_arm = command.policy is not None and command.policy.suffix in _YAML
     if is_arm and command.robot is not None:
         raise UserError(f"{command.policy} and --robot {command.robot} are two arms; give one")
@@ -215,14 +215,16 @@ def _log(
     return Recorder(command.log, names, units, balls)
 
 
-def _check_film(command: RehearseCommand) -> None:
-    """Refuses the name of a film that cannot be written, before the rehearsal."""
-    if command.film is None:
-        return
-    from bounce_mjx.viewers.video import SUFFIXES
+def _check_files(command: RehearseCommand) -> None:
+    """Refuses a film or a log that cannot be written, before the rehearsal."""
+    from bounce_mjx.runs.storage import check_output
 
-    if command.film.suffix.lower() not in SUFFIXES:
-        raise UserError(f"--film {command.film} must end with {', '.join(SUFFIXES)}")
+    check_output(command.log, "--log")
+    if command.film is not None:
+        from bounce_mjx.viewers.video import SUFFIXES, find_ffmpeg
+
+        check_output(command.film, "--film", SUFFIXES)
+        find_ffmpeg()
 
 
 def _film(command: RehearseCommand, config: "WorldConfig", arm: "SimulatedArm", goals: Any) -> None:

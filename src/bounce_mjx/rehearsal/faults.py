@@ -258,8 +258,9 @@ def named_fault(words: str, joint_names: tuple[str, ...]) -> tuple[Act, str]:
     name, colon, joint = words.partition(":")
     kind = KINDS.get(name)
     if kind is None:
-        advice = suggest(name, KINDS) or f"give {', '.join(KINDS)}"
-        raise UserError(f"there is no fault {name}; {advice}")
+        near = suggest(name, KINDS)
+        question = f"{near} " if near else ""
+        raise UserError(f"there is no fault {name}; {question}give one of {', '.join(KINDS)}")
     if kind.of_joint is None:
         if colon:
             raise UserError(f"the fault {name} is not of a joint; give {name} alone")

@@ -111,7 +111,7 @@ class VideoWriter:
         width, height = self._size
         pictures = f"-f rawvideo -pix_fmt rgb24 -s {width}x{height} -r {self.fps} -i -"
         encoding = _ENCODINGS[self._path.suffix.lower()]
-        advice = "give another file with --video"
+        advice = "give another file"
         with writable(self._path, advice), new_file(self._path) as new:
             # It reads pictures from its standard input.
             command = [self._ffmpeg, "-y", "-loglevel", "error", *pictures.split(), *encoding]
