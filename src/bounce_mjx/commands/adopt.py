@@ -218,13 +218,14 @@ def describe(adoption: "Adoption") -> list[str]:
         is_slide = name in slides
         unit = "m" if is_slide else "rad"
         force = "N" if is_slide else "N m"
+        mass = "kg" if is_slide else "kg m²"
         limit = "no force limit"
         if servo.force_limit is not None:
             limit = f"force limit {servo.force_limit:.4g} {force}"
         lines.append(
-            f"  {name}: {position:+.3f} {unit}, inertia {inertia:.3g} "
-            f"{'kg' if is_slide else 'kg m²'}, kp {servo.stiffness:.4g} {force}/{unit}, "
-            f"kv {servo.damping:.4g} {force} s/{unit}, {limit}"
+            f"  {name}: {position:+.3f} {unit}, inertia {inertia:.3g} {mass}, "
+            f"kp {servo.stiffness:.4g} {force}/{unit}, kv {servo.damping:.4g} {force} s/{unit}, "
+            f"{limit}"
         )
     if slides:
         lines.append(

@@ -75,20 +75,19 @@ def describe(
         reason = shorten(first["msg"].removeprefix("Value error, "), 500)
         name = key.rpartition(".")[2]
         return f"{name}: {reason}" if name else reason
-    reason = first["msg"][0].lower() + first["msg"][1:]
+    expected = _expected(first)
+    reason = expected[0].lower() + expected[1:]
     if first["type"] == "missing":
         reason = "an item is missing"
     if first["type"] == "path_type":
         reason = "must be a path"
-    # Of a word in a number's place.
-    reason = reason.partition(", unable to parse")[0]
     if first["type"].startswith(("greater_than", "less_than")) and key in fields:
         reason += f" {unit_of(fields[key].description or '')}".rstrip()
     for other in error.errors()[1:]:
         # Each member of a union says what it accepts of the same value.
         is_of_setting = _setting_of(".".join(_path(other, group)), fields) == key
         if is_of_setting and _items(other) == _items(first):
-            reason += f", or {other['msg'].removeprefix('Input should ')}"
+            reason += f", or {_expected(other).removeprefix('Input should ')}"
     given = shorten(str(first["input"]))
     return f"{flags.get(key, key)} is {given}, but {reason.replace('input should', 'must', 1)}"
 
@@ -155,6 +154,11 @@ def key_of(error: pydantic.ValidationError, group: str = "") -> str:
 def path_of(error: pydantic.ValidationError, group: str = "") -> list[str]:
     """The names of `key_of`, of which an unknown one may have dots itself."""
     return _path(error.errors()[0], group)
+
+
+def _expected(mistake: Mapping[str, Any]) -> str:
+    """What pydantic expected in place of a value, without how it tried to read a word."""
+    return mistake["msg"].partition(", unable to parse")[0]
 
 
 def _items(mistake: Mapping[str, Any]) -> list[int]:

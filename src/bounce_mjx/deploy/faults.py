@@ -182,7 +182,8 @@ class Watch:
         """Raises Fault for a joint that moves as no arm of the training."""
         high = np.max(followed.beside, axis=0)
         low = np.min(followed.beside, axis=0)
-        by_motion = (high - low) / self._allowed_motion(followed)
+        allowed = self._allowed_motion(followed)
+        by_motion = (high - low) / allowed
         by_place = np.maximum(high, -low) / (_TOO_FAR + self._beside_command)
         unlike = np.min(np.maximum(by_motion, by_place), axis=0)
         joint = int(np.argmax(unlike))
@@ -198,12 +199,11 @@ class Watch:
         moved = np.ptp(followed.angles[:, joint])
         commanded = np.ptp(followed.commands[:, joint])
         unlike_motion = (high - low)[nearest, joint]
-        allowed = self._allowed_motion(followed)[joint]
         raise Fault(
             "joint_astray",
             f"{name}: its angle went over {moved:.2g} rad in {_COMPARED:g} s, its commands over "
             f"{commanded:.2g} rad, and it moved {unlike_motion:.2g} rad beside any arm of the "
-            f"training, which may be {allowed:.2g} rad",
+            f"training, which may be {allowed[joint]:.2g} rad",
         )
 
     def _allowed_motion(self, followed: Followed) -> np.ndarray:

@@ -165,35 +165,52 @@ def _alike(
     """
     layout = problem.layout
     windows = problem.windows
-    shape = windows.angles.shape
-    effects = by_unknown[:, : windows.angles[0].size].reshape(*shape, -1)
+    effects = by_unknown[:, : windows.angles[0].size].reshape(*windows.angles.shape, -1)
     counts = windows.split(fit.weights)[0] > 0.0
-    numbers = np.maximum(np.sum(counts, axis=(0, 1)), 1)
-    joints = np.arange(layout.num_joints)
-    every = np.arange(len(fit.vector))
+    columns = np.arange(len(fit.vector))
+
+    def columns_of(name: str) -> np.ndarray:
+        return columns[layout.slices[name]]
+
+    # Unknowns that change together, and by how much.
+    hidden: list[tuple[list[np.ndarray], np.ndarray]] = []
+    frictions = [columns_of("joint_frictionloss")]
+    stiffnesses = [columns_of("servo_gain"), columns_of("servo_damping")]
+    for together in (frictions, stiffnesses):
+        hidden.append((together, _ALIKE / _size_of_effect(effects, counts, together)))
+    # A simulated servo answers anywhere within a physics step.
+    of_step = layout.physics_dt / np.sqrt(12.0)
+    for name, least in (("delay_variance", 0.0), ("delay", of_step)):
+        delay = columns_of(name)
+        of_all_joints = np.repeat(delay, layout.num_joints)
+        size = np.mean(_size_of_effect(effects, counts, [of_all_joints]), keepdims=True)
+        hidden.append(([delay], np.hypot(_ALIKE / size, least)))
+
     changes = np.zeros((_RESAMPLES, len(fit.vector)))
-
-    def sizes(columns: Sequence[np.ndarray]) -> np.ndarray:
-        """Root mean square [n] of what the unknowns in columns [n] together change in each joint,
-        in units of the noise."""
-        along = sum(effects[:, :, joints, column] for column in columns)
-        return np.sqrt(np.sum((along * counts) ** 2, axis=(0, 1)) / numbers)
-
-    def hide(places: Sequence[np.ndarray], spread: np.ndarray) -> None:
-        """Changes the unknowns at these places together."""
-        spread = np.minimum(spread, np.min(room[np.array(places)], axis=0))
+    for together, spread in hidden:
+        spread = np.minimum(spread, np.min(room[np.array(together)], axis=0))
         draws = spread * random.normal(size=(_RESAMPLES, len(spread)))
-        for place in places:
-            changes[:, place] += draws
-
-    for names in (("joint_frictionloss",), ("servo_gain", "servo_damping")):
-        places = [every[layout.slices[name]] for name in names]
-        hide(places, _ALIKE / np.maximum(sizes(places), 1e-12))
-    for name, least in (("delay_variance", 0.0), ("delay", layout.physics_dt / np.sqrt(12.0))):
-        place = every[layout.slices[name]]
-        size = np.mean(sizes([np.repeat(place, len(joints))]), keepdims=True)
-        hide([place], np.hypot(_ALIKE / np.maximum(size, 1e-12), least))
+        for unknowns in together:
+            changes[:, unknowns] += draws
     return changes
+
+
+def _size_of_effect(
+    effects: np.ndarray, counts: np.ndarray, together: Sequence[np.ndarray]
+) -> np.ndarray:
+    """Root mean square [n] of what a unit of unknowns that change together does to each joint's
+    angles, in units of the noise; a little where it does nothing.
+
+    Args:
+      effects: derivatives [S, A, n, P] of the angles in units of the noise.
+      counts: which angles [S, A, n] count.
+      together: for each kind of unknown, that of each joint [n].
+    """
+    joints = np.arange(effects.shape[2])
+    along = sum(effects[:, :, joints, unknowns] for unknowns in together)
+    numbers = np.maximum(np.sum(counts, axis=(0, 1)), 1)
+    size = np.sqrt(np.sum((along * counts) ** 2, axis=(0, 1)) / numbers)
+    return np.maximum(size, 1e-12)
 
 
 def resample(
