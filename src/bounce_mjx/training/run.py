@@ -30,7 +30,7 @@ from bounce_mjx.reports.tables import details_line, results_table, seeds_table, 
 from bounce_mjx.resources import POLICIES, policy_path
 from bounce_mjx.runs import folders
 from bounce_mjx.runs.checkpoints import read_actor, read_record
-from bounce_mjx.runs.config import TrainConfig, load_run_config
+from bounce_mjx.runs.config import TrainConfig, imports_of, load_run_config
 from bounce_mjx.runs.layers import FLAGS, PYTHON, Layers, layers_on
 from bounce_mjx.runs.progress import load_results
 from bounce_mjx.runs.start import FileFlags, StartFlags, find_start
@@ -308,6 +308,8 @@ def print_results(seeds: Sequence[job.SeedRun], console: Console) -> job.SeedRun
     else:
         console.print(results_table(report, f"best checkpoint, {best.progress.best_steps:,} steps"))
         say(console, details_line(report))
+        # The printed results are of fresh resets; those that chose the checkpoint are of others.
+        say(console, f"chosen for {best.best.report.merit}")
     if unsolved := unsolved_line(report, len(seeds)):
         say(console, unsolved)
     spent = ", ".join(f"{name} {value:.1f} s" for name, value in best.seconds.items())
@@ -324,7 +326,7 @@ def leave_report(seed: job.SeedRun, console: Console) -> None:
       TrainingStopped: a signal came meanwhile.
     """
     started = time.perf_counter()
-    words = shlex.join([str(seed.run), *job.imports_of(seed.config)])
+    words = shlex.join([str(seed.run), *imports_of(seed.run)])
     again = f"draw it with: bounce-mjx report {words}"
     try:
         # Imported during the compilation (`Job.compile`).
