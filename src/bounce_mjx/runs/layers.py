@@ -4,11 +4,13 @@ One word fixes the classes (`start.py`): which task, which algorithm and which p
 training begins with. Everything else is values. They are layers, in the order of `Rank`, and a
 later one wins.
 
-A resumed run has two: its own config, and what the user says; more steps end its
-`stop_when_solved` where that had ended it (`Layers._beyond_solved`). A whole config, of Python, has
-no presets below it. `layers_on` reads the layers below the user's, each file once. `Layers.config`
-merges all of them and validates the result, once; the config then knows what set each of its values
-(`TrainConfig.sources`).
+`layers_on` reads the layers below the user's, each file once. `Layers.config` puts the user's on
+top, merges all of them and validates the result, once; the config then knows what set each of its
+values (`TrainConfig.sources`).
+
+A resumed run has two layers: its own config, and what the user says; more steps switch its
+`stop_when_solved` off where that had ended it (`Layers._beyond_results`). A whole config, of
+Python, has no presets below it.
 """
 
 import dataclasses
@@ -90,10 +92,10 @@ def layers_on(start: Start, files: FileFlags, machine: Path | None = None) -> "L
     Raises:
       UserError: a file is missing, wrong, or of another start.
     """
-    if start.resumed is not None:
+    if start.resumed_config is not None:
         given = {"config": files.config, "robot": files.robot, "world": files.world}
         check_not_given(start.place, given)
-        return Layers(start, (Layer(f"the run {start.place}", start.resumed.model_dump()),))
+        return Layers(start, (Layer(f"the run {start.place}", start.resumed_config.model_dump()),))
     if start.whole is None:
         read = _layers_of_config(start, files.config, machine)
     else:
@@ -273,7 +275,7 @@ class Layers:
         user_source = PYTHON if flags is None else FLAGS
         # The policy of a warm start is the checkpoint that was found, not the word for it.
         user = self._layer_of_user(user_source, {**(said or {}), **self.start.said})
-        above = [*self._beyond_solved(user), user]
+        above = [*self._beyond_results(user), user]
         layers = [*self.below, *above]
         for layer in layers:
             self._check_groups(layer)
@@ -292,10 +294,10 @@ class Layers:
                 (name,) = mistake.path
                 text = f"{name} is no setting; leave it out, and give --{name} or train({name}=...)"
             raise UserError(f"{shorten(setter)}: {text}") from mistake.error
-        if self.start.resumed is not None:
-            _check_resumable(self.start.resumed, config)
+        if self.start.resumed_config is not None:
+            _check_resumable(self.start.resumed_config, config)
             _, changed = _merge(above)
-            sources = self.start.resumed.sources | changed
+            sources = self.start.resumed_config.sources | changed
         config.set_sources(sources)
         return config
 
@@ -338,10 +340,10 @@ class Layers:
                 return full
         return key
 
-    def _beyond_solved(self, user: Layer) -> list[Layer]:
-        """A layer for a run that has met all results, where a number of steps is asked for: it goes
-        on to that number."""
-        if self.start.resumed is None or "total_steps" not in user.values:
+    def _beyond_results(self, user: Layer) -> list[Layer]:
+        """A layer for a resumed run that its results have ended (`waits_are_over`), where a number
+        of steps is asked for: it goes on to that number."""
+        if self.start.resumed_config is None or "total_steps" not in user.values:
             return []
         from bounce_mjx.runs.folders import latest_checkpoint, run_of
         from bounce_mjx.runs.progress import Progress, waits_are_over

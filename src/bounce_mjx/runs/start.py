@@ -91,7 +91,7 @@ class Start(NamedTuple):
     """A whole config, of Python, whose task and algorithm these are; no preset lies below it."""
     place: Path | None = None
     """Folder of the run that is resumed, or a checkpoint in it."""
-    resumed: TrainConfig | None = None
+    resumed_config: TrainConfig | None = None
     """Config of that run."""
     notes: tuple[str, ...] = ()
     """Which run latest stands for."""
@@ -254,7 +254,7 @@ def _start_of_run(word: Path, flags: StartFlags, whole: TrainConfig | None) -> S
         algorithm_name=config.algorithm,
         said={},
         place=place,
-        resumed=config,
+        resumed_config=config,
     )
 
 
