@@ -83,7 +83,7 @@ class Dribble(task.Task):
     """Many low bounces: apexes 5 to 10 cm over the paddle, more than three a second, for 20 s."""
 
     Config = Config
-    curves = (task.Curve("task/apex_error", "apex_error", "apexes", "|apex − wish|, cm", 100.0),)
+    curves = (task.Curve("task/apex_error", "apex_error", "apexes", "|apex − wish|", 100.0, "cm"),)
 
     def reset(self, start: task.Start) -> jax.Array:
         # The task's state: whether the ball rose after the last step [], bool.

@@ -41,9 +41,10 @@ from bounce_mjx.runs.layers import read_layers
 from bounce_mjx.runs.start import Choice
 from bounce_mjx.runs.storage import lock_run
 from bounce_mjx.training import hosts, job, saving
-from bounce_mjx.training.events import Event
+from bounce_mjx.training.events import Event, block_line, evaluation_line
 from bounce_mjx.training.faults import first_block_fault
-from bounce_mjx.training.run import Run
+from bounce_mjx.training.run import Run, print_results
+from bounce_mjx.training.seeds import SeedRun
 from bounce_mjx.training.trainer import Snapshot
 from tiny_runs import contents
 
@@ -219,7 +220,7 @@ def test_what_a_killed_process_was_writing_is_removed(tmp_path: Path) -> None:
 
 def test_a_failed_screening_is_no_evaluation(tmp_path: Path) -> None:
     run = train(tmp_path, {1: 1.0, 2: 2.0}, screening=True, said=(said := io.StringIO()))
-    assert said.getvalue().count("screening (1 episodes) at") == 2
+    assert said.getvalue().count("screening (1 of 1,024 episodes) at") == 2
     assert "evaluation at" not in said.getvalue()
     assert [e["screening"] for e in results_of(run)["evaluations"]] == [True, True]
     # The end reports all episodes.
@@ -337,6 +338,58 @@ def test_a_training_ends_at_the_whole_block_nearest_to_its_steps(
     assert results_of(run)["trained_steps"] == trained
 
 
+def test_a_progress_line_has_each_curves_unit() -> None:
+    """The log has metres; a number without a unit, and a curve without a point, get none."""
+    points = []
+    for apex_error in (0.05, 0.09):
+        curves = {"episode/bounces_at_end": 2.0, "task/apex_error": apex_error}
+        points.append({"speed/steps_per_second": 1.0, "episode/return": 407.4} | curves)
+    config = TrainConfig(stop_when_solved=True)
+    several = block_line(config, 64, 4.93, None, points)
+    assert several == (
+        "64 steps  1 steps/s  return 407 +- 0  bounces at end 2 +- 0  apex error 7 +- 2 cm  "
+        "block 4.9 s"
+    )
+    one = block_line(config, 64, 4.93, 652.0, points[:1])
+    assert one.endswith("  apex error 5 cm  block 4.9 s, ends in 652 s or by its results")
+
+
+def test_a_screening_whose_policy_meets_all_results_says_why_it_ended() -> None:
+    result = Result("stable", "episodes, %", 99.7, ">= 99", True, 0.5)
+    full = Report((result,), {"episodes": 1024.0})
+    screened = Report((result,), {"episodes": 128.0}, screening=True)
+    config = TrainConfig()
+    met = "1 of 1 results met (stable 99.7)"
+    at = f"at 64 steps: {met}"
+    assert evaluation_line(config, 64, [full]) == f"evaluation {at}, not yet with a margin"
+    no_better = "with no larger margin than the best so far"
+    words = f"screening (128 of 1,024 episodes) {at}, {no_better}"
+    assert evaluation_line(config, 64, [screened]) == words
+    several = evaluation_line(TrainConfig(num_seeds=2), 64, [screened, screened])
+    assert several.endswith(f": 2 of 2 seeds meet all results, {no_better}")
+
+
+def test_the_best_checkpoint_is_told_by_what_chose_it(tmp_path: Path) -> None:
+    """Not by its figures on fresh resets, which it may miss."""
+    clear = Result("stable", "episodes, %", 99.9, ">= 99", True, 1.0)
+    close = Result("height", "bounces, %", 95.2, ">= 95", True, 0.1)
+    missed = dataclasses.replace(close, value=94.9, passed=False, margin=0.0)
+    details = {"episodes": 64.0, "mean_return": 1.0}
+
+    def reason(chosen: Result) -> str:
+        seed = SeedRun(tmp_path, TrainConfig(), {})
+        seed.add_report(Report((clear, chosen), details), None, 64, 0.0)
+        seed.progress.best = Report((clear, missed), details)
+        print_results([seed], Console(file=(said := io.StringIO())))
+        (line,) = (line for line in said.getvalue().splitlines() if line.startswith("chosen for"))
+        return line
+
+    assert reason(close) == "chosen for the largest margin (its tightest: height)"
+    assert reason(missed) == "chosen for the most results met, then the highest return"
+    with_margin = dataclasses.replace(close, margin=1.0)
+    assert reason(with_margin) == "chosen for a margin in all results, then the highest return"
+
+
 def test_a_training_stops_once_its_results_have_a_margin(tmp_path: Path) -> None:
     """It tells the first evaluation that met all results, and the end; resumed with more steps, it
     goes on."""
@@ -418,7 +471,7 @@ def test_a_callback_sees_blocks_and_evaluations_and_ends_the_training(tmp_path: 
     assert ends in said.getvalue()
     # The first block, during which other programs are compiled, says nothing about those to come.
     blocks = [line for line in said.getvalue().splitlines() if "steps/s" in line]
-    assert [" left" in line for line in blocks] == [False, True]
+    assert [", ends in " in line for line in blocks] == [False, True]
     blocks = [(64, 0.0, False), (64, 5.0, True), (128, 0.0, False), (128, 9.0, True)]
     assert seen == [3 * BLOCK, *blocks, "closed"]
     results = results_of(run)

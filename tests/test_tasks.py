@@ -557,6 +557,7 @@ def test_a_goal_is_not_shown_by_a_quantity_of_another_group(wrong: Env) -> None:
         (("task/error", None), "the metric of a task.Curve .* is None; give a name"),
         (("task/error", "error", 3), "the over of a task.Curve .* is 3; give a name"),
         (("a", "b", "steps", 100.0), "the title of the curve a .* is 100.0; give words"),
+        (("a", "b", "steps", "", 1.0, None), "the unit of the curve a .* is None; give words"),
         (("a", "b", "steps", "", "cm"), "the scale of the curve a .* is 'cm'; give a finite num"),
     ],
 )

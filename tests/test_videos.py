@@ -155,12 +155,16 @@ def test_video_shows_the_arm_and_a_moving_ball(tmp_path: Path, case: tuple) -> N
     done = run([*command.split(), *flags], tmp_path, MUJOCO_GL=backend)
     assert done.returncode == 0, done.stderr
     assert "Traceback" not in done.stderr
+    # Without a terminal a line for each tenth, however few frames there are.
+    told = re.findall(r"recording: (\d+) of (\d+) frames", done.stdout)
+    number = round(0.6 * fps) + 1
+    assert told[-1] == (str(number), str(number)) and len(told) == 10
     assert mine.read_text() == "mine"
     assert set(os.listdir(tmp_path)) == {name, mine.name, planted.name}
     rate, frames = read_video(tmp_path / name)
     assert rate == fps
     # From the reset to the last step.
-    assert frames.shape == (round(0.6 * fps) + 1, 240, 320, 3)
+    assert frames.shape == (number, 240, 320, 3)
     red, green, blue = np.moveaxis(frames[0].astype(int), -1, 0)
     orange = (red > 140) & (green < 140) & (blue < 90)
     assert 0.01 < orange.mean() < 0.2

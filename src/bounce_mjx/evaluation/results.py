@@ -59,6 +59,17 @@ class Report:
         met = sum(result.passed is not False for result in self.results)
         return not self.screening, met, self.margin, self.details["mean_return"]
 
+    @property
+    def merit(self) -> str:
+        """What makes this evaluation the best of a training, in words (`score`)."""
+        if not self.passed:
+            return "the most results met, then the highest return"
+        if self.passed_with_margin:
+            return "a margin in all results, then the highest return"
+        judged = [result for result in self.results if result.passed is not None]
+        tightest = min(judged, key=lambda result: result.margin or 0.0)
+        return f"the largest margin (its tightest: {tightest.name})"
+
     def to_dict(self) -> dict[str, Any]:
         """The report as plain data for JSON, with null for a missing figure."""
         return {

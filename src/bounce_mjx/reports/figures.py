@@ -240,7 +240,7 @@ def _draw_curve(axes: Axes, groups: Sequence[Group], shown: Curve) -> None:
                 axes.axvline(
                     run.solved_steps, color=f"C{i}", ls=":", lw=1.0, label="all results met"
                 )
-    axes.set_title(shown.title)
+    axes.set_title(shown.heading)
     axes.set_xlim(left=0)
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.xaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))

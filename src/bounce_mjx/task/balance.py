@@ -114,7 +114,7 @@ class Balance(task.Task):
 
     Config = Config
     config: Config
-    curves = (task.Curve("task/error", "error", title="ball to point, cm", scale=100.0),)
+    curves = (task.Curve("task/error", "error", title="ball to point", scale=100.0, unit="cm"),)
     num_draws = 4
     ball_thrown = False
     ball_dropped = False

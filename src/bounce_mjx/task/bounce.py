@@ -219,9 +219,13 @@ class Bounce(task.Task):
         task.Curve(
             "episode/bounces_at_end", "n_bounces", "episodes", "bounces in a row at its end"
         ),
-        task.Curve("task/apex_error", "apex_error", "bounced", "|apex − target height|, cm", 100.0),
-        task.Curve("task/apex_offset", "apex_offset", "bounced", "apex − target height, cm", 100.0),
-        task.Curve("task/ball_xy_error", "ball_xy_error"),
+        task.Curve(
+            "task/apex_error", "apex_error", "bounced", "|apex − target height|", 100.0, "cm"
+        ),
+        task.Curve(
+            "task/apex_offset", "apex_offset", "bounced", "apex − target height", 100.0, "cm"
+        ),
+        task.Curve("task/ball_xy_error", "ball_xy_error", scale=100.0, unit="cm"),
         task.Curve("task/bounces_so_far", "n_bounces"),
     )
     critic_metrics = ("n_bounces",)

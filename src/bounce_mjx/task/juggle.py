@@ -132,8 +132,8 @@ class Juggle(task.Task):
     num_balls = (2, 3)
     ball_rests = False
     curves = (
-        task.Curve("task/turns", "in_turn", "hits", "alternating hits, %", 100.0),
-        task.Curve("task/height_error", "height_error", "apexes", "|apex − height|, cm", 100.0),
+        task.Curve("task/turns", "in_turn", "hits", "alternating hits", 100.0, "%"),
+        task.Curve("task/height_error", "height_error", "apexes", "|apex − height|", 100.0, "cm"),
     )
 
     # Places and times.

@@ -180,7 +180,14 @@ class Curve:
     title: str = ""
     """Title in the report; "" leaves it out there."""
     scale: float = 1.0
-    """Factor from the metric's unit to the title's, in the report alone."""
+    """Factor from the metric's unit to `unit`. The log has the metric's own."""
+    unit: str = ""
+    """Unit in the report and on the console, such as cm; "" for a number without one."""
+
+    @property
+    def heading(self) -> str:
+        """The title with the unit, as a report has it over the curve."""
+        return f"{self.title}, {self.unit}" if self.unit else self.title
 
     def __post_init__(self) -> None:
         for name in ("tag", "metric", "over"):
@@ -192,11 +199,13 @@ class Curve:
                     f"the {name} of a task.Curve{where_made()} is {shorten(repr(value))}; give a "
                     "name"
                 )
-        if not isinstance(self.title, str):
-            raise UserError(
-                f"the title of the curve {self.tag}{where_made()} is {shorten(repr(self.title))}; "
-                "give words"
-            )
+        for name in ("title", "unit"):
+            value = getattr(self, name)
+            if not isinstance(value, str):
+                raise UserError(
+                    f"the {name} of the curve {self.tag}{where_made()} is {shorten(repr(value))}; "
+                    "give words"
+                )
         if not is_finite(self.scale):
             raise UserError(
                 f"the scale of the curve {self.tag}{where_made()} is {shorten(repr(self.scale))}; "

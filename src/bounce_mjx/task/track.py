@@ -152,8 +152,8 @@ class Track(task.Task):
     ball_rests = False
     ball_thrown = False
     curves = (
-        task.Curve("task/error", "error", "apexes", "distance of apex and point, cm", 100.0),
-        task.Curve("task/height_error", "height_error", "apexes", "|apex − height|, cm", 100.0),
+        task.Curve("task/error", "error", "apexes", "distance of apex and point", 100.0, "cm"),
+        task.Curve("task/height_error", "height_error", "apexes", "|apex − height|", 100.0, "cm"),
     )
 
     @property

@@ -13,6 +13,7 @@ from bounce_mjx.evaluation.results import Report
 from bounce_mjx.learning.policy import Policy
 from bounce_mjx.reports.tables import count_text, result_text
 from bounce_mjx.runs.config import TrainConfig
+from bounce_mjx.task.task import Curve
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,32 +98,49 @@ def block_line(
     """
     rate = count_text(points[0]["speed/steps_per_second"])
     line = f"{count_text(steps)} steps  {rate} steps/s"
-    for tag in ("episode/return", *(curve.tag for curve in config.env.task.curves)):
-        values = [point[tag] for point in points if tag in point]
-        form = ".0f" if tag == "episode/return" else ".3g"
-        spread = f" +- {np.std(values):{form}}" if len(values) > 1 else ""
-        if values:
-            line += f"  {tag.rpartition('/')[2]} {np.mean(values):{form}}{spread}"
-    line += f"  {seconds:.1f} s"
+    line += _curve_text(Curve("episode/return", ""), ".0f", points)
+    for curve in config.env.task.curves:
+        line += _curve_text(curve, ".3g", points)
+    line += f"  block {seconds:.1f} s"
     if left:
-        bound = "at most " if config.stop_when_solved else ""
-        line += f", {bound}{left:.0f} s left"
+        or_sooner = " or by its results" if config.stop_when_solved else ""
+        line += f", ends in {left:.0f} s{or_sooner}"
     return line
 
 
-def evaluation_line(num_seeds: int, steps: int, reports: Sequence[Report]) -> str:
+def _curve_text(curve: Curve, form: str, points: list[dict[str, float]]) -> str:
+    """A curve's newest point in its unit, the mean over the seeds that have one, and their
+    standard deviation; empty if none has.
+
+    Args:
+      form: format of a number.
+      points: of each seed.
+    """
+    values = [curve.scale * point[curve.tag] for point in points if curve.tag in point]
+    if not values:
+        return ""
+    name = curve.tag.rpartition("/")[2].replace("_", " ")
+    spread = f" +- {np.std(values):{form}}" if len(values) > 1 else ""
+    unit = f" {curve.unit}" if curve.unit else ""
+    return f"  {name} {np.mean(values):{form}}{spread}{unit}"
+
+
+def evaluation_line(config: TrainConfig, steps: int, reports: Sequence[Report]) -> str:
     """An evaluation, with a report of each seed that has not diverged."""
     passed = [report for report in reports if report.passed]
     sure = sum(report.passed_with_margin for report in passed)
-    line = f"{len(passed)} of {num_seeds} seeds meet all results"
+    line = f"{len(passed)} of {config.num_seeds} seeds meet all results"
     missing = f", {sure} with a margin"
-    if num_seeds == 1:
+    if config.num_seeds == 1:
         (report,) = reports
         figures = (f"{r.name} {result_text(r, '.4g')}" for r in report.results)
         line = f"{report.summary} ({', '.join(figures)})"
         missing = ", not yet with a margin"
     kind = "evaluation"
     if reports[0].screening:
-        kind = f"screening ({reports[0].details['episodes']:.0f} episodes)"
-    line += missing if sure < len(passed) else ""
-    return f"{kind} at {count_text(steps)} steps: {line}"
+        episodes = reports[0].details["episodes"]
+        kind = f"screening ({episodes:,.0f} of {config.eval_episodes:,} episodes)"
+        # A larger one would have been evaluated in all episodes.
+        missing = ", with no larger margin than the best so far"
+    note = missing if sure < len(passed) or (passed and reports[0].screening) else ""
+    return f"{kind} at {count_text(steps)} steps: {line}{note}"

@@ -306,6 +306,8 @@ class Job:
             evaluators = make_evaluators(self.config, self.env, self.trainer.mesh, self.pool)
             return evaluators, compiling
 
+        # A console that is no terminal shows no status.
+        self.say("compiling: the first time, about a minute on a CPU")
         with self.console.status("compiling"):
             self.evaluators, compiling = self.wait_for(self.pool.submit(trace))
             self.open_logs()
@@ -362,7 +364,7 @@ class Job:
                 told.append(self.event(seed, events.points_of(report), report, policy))
                 seed.add_report(report, policy, self.steps, seconds)
         judged = [event.report for event in told]
-        self.say(events.evaluation_line(self.config.num_seeds, self.steps, judged))
+        self.say(events.evaluation_line(self.config, self.steps, judged))
         self.tell(told)
         self.needs_save = True
         # With the callbacks, such as a video.
@@ -545,8 +547,9 @@ class Job:
         if all(seed.progress.margin_steps is not None for seed in self.healthy()):
             return "the training ends: all results are met with a margin (stop_when_solved)"
         return (
-            f"the training ends: all results are met, and no margin came within {PATIENCE:g} times "
-            "the steps until then (stop_when_solved)"
+            "the training ends: all results are met, and it went on to "
+            f"{PATIENCE:g} times the steps of the first time, but they were not met clearly "
+            "(with a margin; stop_when_solved)"
         )
 
     def is_evaluated(self) -> bool:

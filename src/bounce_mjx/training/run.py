@@ -308,6 +308,8 @@ def print_results(seeds: Sequence[job.SeedRun], console: Console) -> job.SeedRun
     else:
         console.print(results_table(report, f"best checkpoint, {best.progress.best_steps:,} steps"))
         say(console, details_line(report))
+        # The printed results are of fresh resets; those that chose the checkpoint are of others.
+        say(console, f"chosen for {best.best.report.merit}")
     if unsolved := unsolved_line(report, len(seeds)):
         say(console, unsolved)
     spent = ", ".join(f"{name} {value:.1f} s" for name, value in best.seconds.items())

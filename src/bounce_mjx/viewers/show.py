@@ -6,6 +6,7 @@ from functools import partial
 from typing import NamedTuple
 
 from rich.console import Console
+from rich.status import Status
 
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
@@ -117,16 +118,25 @@ def _record(
         check_output(options.html, "--html", SUFFIXES)
 
     simulation = simulate()
-    with console.status("recording"):
+    with console.status("recording") as status:
         recording = simulation.record(options.seconds)
         if options.html is not None:
             page = replay(simulation.env, recording, options.fps, start.names)
             write_output(options.html, page)
         if writer is not None:
-            writer.write(simulation.env, recording)
+            writer.write(simulation.env, recording, partial(_tell_frames, console, status))
     for path in (options.video, options.html):
         if path is not None:
             console.out(f"written: {path}", highlight=False)
+
+
+def _tell_frames(console: Console, status: Status, done: int, number: int) -> None:
+    """Says how far a video is: on a terminal in the status line, elsewhere a line each tenth."""
+    text = f"recording: {done:,} of {number:,} frames"
+    status.update(text)
+    ends_a_tenth = 10 * done // number > 10 * (done - 1) // number
+    if ends_a_tenth and not console.is_terminal:
+        console.out(text, highlight=False)
 
 
 def _serve(

@@ -3,7 +3,7 @@
 import contextlib
 import shutil
 import subprocess
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -91,15 +91,23 @@ class VideoWriter:
         self._ffmpeg = find_ffmpeg()
         choose_opengl()
 
-    def write(self, env: Env, recording: EnvFrame) -> None:
+    def write(
+        self, env: Env, recording: EnvFrame, tell: Callable[[int, int], None] | None = None
+    ) -> None:
         """Writes the first environment of a recording.
+
+        Args:
+          tell: is called after each picture with their number so far, and that of all.
 
         Raises:
           UserError: the file cannot be written.
           Interrupted: Ctrl-C came; no file is left.
         """
         frames = resample(recording, env.dt, self.fps)
-        self.write_pictures(draw_frames(env, frames, self._size, self.fps, self._zoom))
+        pictures = draw_frames(env, frames, self._size, self.fps, self._zoom)
+        if tell is not None:
+            pictures = _counted(pictures, len(frames.time), tell)
+        self.write_pictures(pictures)
 
     def write_pictures(self, shown: Iterable[np.ndarray]) -> None:
         """Writes pictures, each [height, width, 3] (uint8), one a frame.
@@ -139,6 +147,15 @@ class VideoWriter:
             finally:
                 encoder.kill()
                 encoder.communicate()
+
+
+def _counted(
+    pictures: Iterable[np.ndarray], number: int, tell: Callable[[int, int], None]
+) -> Iterator[np.ndarray]:
+    """The pictures, each of which is told (`VideoWriter.write`)."""
+    for done, picture in enumerate(pictures, start=1):
+        yield picture
+        tell(done, number)
 
 
 def _wait(encoder: subprocess.Popen, stop: StopRequest) -> bytes:
