@@ -234,6 +234,15 @@ def _with_networks(of_env: Layer, start: Start) -> Layer:
 # Merging and validating -------------------------------------------------------------------------
 
 
+class CommandLine(NamedTuple):
+    """A command's own words for the settings, which its errors use."""
+
+    prog: str
+    """Such as bounce-mjx train."""
+    flags: Mapping[str, str]
+    """The flag of each setting, by dotted key."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Layers:
     """The layers below what the user says, the lowest first."""
@@ -255,24 +264,20 @@ class Layers:
         return _title_of(self.below)
 
     def config(
-        self,
-        said: Mapping[str, Any] | None = None,
-        flags: Mapping[str, str] | None = None,
-        prog: str = "",
+        self, said: Mapping[str, Any] | None = None, command: CommandLine | None = None
     ) -> TrainConfig:
         """The typed config, with what the user says on top.
 
         Args:
           said: values by their keys. A key may be dotted, and one of `env` or `ppo` stand alone:
             num_envs for ppo.num_envs.
-          flags: the flags of a command line by dotted key, for errors; None in Python.
-          prog: the command, for errors.
+          command: where the user says it; None in Python.
 
         Raises:
           UserError: a key is unknown, a value is out of range, or it must be that of the resumed
             run. The error names the layer that set it.
         """
-        user_source = PYTHON if flags is None else FLAGS
+        user_source = PYTHON if command is None else FLAGS
         # The policy of a warm start is the checkpoint that was found, not the word for it.
         user = self._layer_of_user(user_source, {**(said or {}), **self.start.said})
         above = [*self._beyond_results(user), user]
@@ -286,9 +291,9 @@ class Layers:
             config = self._validated(values)
         except _Mistake as mistake:
             setter = _setter_of(mistake.path, layers)
-            if flags is not None and setter == FLAGS:
-                text = describe(mistake.error, self.fields, flags, mistake.group)
-                raise UserError(f"{text} (see {prog} --help)") from mistake.error
+            if command is not None and setter == FLAGS:
+                text = describe(mistake.error, self.fields, command.flags, mistake.group)
+                raise UserError(f"{text} (see {command.prog} --help)") from mistake.error
             text = describe(mistake.error, self.fields, group=mistake.group)
             if setter != PYTHON and mistake.path in (["robot"], ["world"]):
                 (name,) = mistake.path
