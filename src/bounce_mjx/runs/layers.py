@@ -185,11 +185,6 @@ def _layers_of_files(files: Iterable[ConfigFile]) -> list[Layer]:
     return layers
 
 
-def _title_of(layers: Sequence[Layer]) -> str:
-    """The sources of the layers in words, the last first."""
-    return " on ".join(layer.source for layer in reversed(layers))
-
-
 def _changed_defaults(algorithm_config: type[PPOConfig]) -> list[Layer]:
     """The defaults of an algorithm of the user's that differ from PPO's (`Rank.ALGORITHM`): it
     means these values, and the machine's preset below them was made for PPO."""
@@ -261,7 +256,7 @@ class Layers:
     @property
     def title(self) -> str:
         """The sources of the layers in words, the last first."""
-        return _title_of(self.below)
+        return " on ".join(layer.source for layer in reversed(self.below))
 
     def config(
         self, said: Mapping[str, Any] | None = None, command: CommandLine | None = None

@@ -17,7 +17,7 @@ from bounce_mjx.resources import POLICIES, policy_folder
 from bounce_mjx.runs.config import (
     TrainConfig,
     copied_code,
-    fields_of,
+    fields_of_training,
     is_as_copied,
     load_run_config,
     runs_folder,
@@ -99,7 +99,7 @@ class Start(NamedTuple):
     @property
     def fields(self) -> dict[str, FieldInfo]:
         """The settings that a training from here has, by dotted key."""
-        return fields_of(self.task.Config, self.algorithm_config)
+        return fields_of_training(self.task.Config, self.algorithm_config)
 
 
 def find_start(word: str | None, flags: StartFlags, whole: TrainConfig | None = None) -> Start:
