@@ -3,6 +3,7 @@
 import re
 
 import numpy as np
+from rich.console import Console
 from rich.markup import escape
 from rich.table import Column, Table
 
@@ -40,6 +41,17 @@ def plain_table(title: str, *columns: Column | str) -> Table:
     left = dict(title_justify="left", caption_justify="left")
     look = dict(box=None, pad_edge=False, padding=(0, 1, 0, 0))
     return Table(*columns, title=escape(title), **left, **look)
+
+
+def print_table(console: Console, table: Table) -> None:
+    """Prints a table; elsewhere than on a terminal, without blanks at the ends of its lines."""
+    if console.is_terminal:
+        console.print(table)
+        return
+    with console.capture() as captured:
+        console.print(table)
+    for line in captured.get().splitlines():
+        console.out(line.rstrip(), highlight=False)
 
 
 def results_table(report: Report, title: str) -> Table:
@@ -130,4 +142,4 @@ def details_line(report: Report) -> str:
         if name != "episodes":
             rounded = None if value is None else float(f"{value:.4g}")
             parts.append(f"{title} {figure_text(rounded, 'g')} {unit}".rstrip())
-    return f"{report.details['episodes']:.0f} episodes: {', '.join(parts)}"
+    return f"{report.details['episodes']:,.0f} episodes: {', '.join(parts)}"
