@@ -8,7 +8,7 @@ from typing import Any
 
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.runs.layers import ORDER
+from bounce_mjx.runs.layers import Rank
 from bounce_mjx.world.randomization import Term
 
 _HEAD = """# Config reference
@@ -46,7 +46,7 @@ def main() -> None:
 
 def reference() -> str:
     """The whole page, Markdown."""
-    order = "\n".join(f"{number}. {layer}" for number, layer in enumerate(ORDER, start=1))
+    order = "\n".join(f"{number}. {layer}" for number, layer in enumerate(Rank, start=1))
     sections = [_section(group, prefix) for group, prefix in _groups(TrainConfig(), "")]
     return _HEAD.replace("{order}", order) + "".join(sections)
 

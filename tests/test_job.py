@@ -28,7 +28,7 @@ from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.ppo import PPO
 from bounce_mjx.runs import checkpoints
 from bounce_mjx.runs.checkpoints import policy_shapes, read_networks, read_policy, read_record
-from bounce_mjx.runs.config import TrainConfig, load_run_config
+from bounce_mjx.runs.config import TrainConfig, imports_of, load_run_config
 from bounce_mjx.runs.folders import (
     Checkpoint,
     best_checkpoint,
@@ -276,7 +276,9 @@ def test_an_algorithm_brings_its_own_trainer(tmp_path: Path, monkeypatch) -> Non
     scores = Scores({1: 5.0, 2: 9.0, 3: 7.0}, {}, False)
     run = _run_of(config, None, (), io.StringIO(), scores)
     assert (config.ppo.start_steps, config.iterations_per_block) == (8, 2)
-    assert results_of(run)["best_steps"] == 128 and (run / "algorithm/counting.py").exists()
+    assert results_of(run)["best_steps"] == 128
+    assert imports_of(run) == []
+    assert imports_of(run, to_train=True) == ["--import", str(run / "algorithm/counting.py")]
     longer = read_layers(Choice(word=str(run))).config({"total_steps": 192})
     _run_of(longer, run, (), io.StringIO(), scores)
     assert evaluated_steps(run) == [64, 128, 192]

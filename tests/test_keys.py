@@ -169,7 +169,7 @@ def of_run(config: TrainConfig) -> tuple:
         job = open_job(config, Console(quiet=True), stack)
         # As if all results were met: then `stop_when_solved` ends it before the first block.
         patch.setattr("bounce_mjx.training.job.waits_are_over", lambda seeds: True)
-        while not job.is_finished():
+        while not job.ends_here():
             blocks.append(job.steps)
             job.steps += job.steps_per_block
         nothing = types.SimpleNamespace(compile=lambda: None)

@@ -31,7 +31,7 @@ from bounce_mjx.env.vector import VectorStep
 from bounce_mjx.errors import UserError
 from bounce_mjx.learning.metrics import rollout_metrics, step_metrics
 from bounce_mjx.runs import checkpoints
-from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig, load_run_config
+from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig, imports_of, load_run_config
 from bounce_mjx.runs.creation import create_run
 from bounce_mjx.runs.folders import find_checkpoint
 from bounce_mjx.runs.layers import read_preset
@@ -77,7 +77,8 @@ def test_a_task_without_events_goes_through_every_command(
     said = command("train", "rest", *task[2:], *TINY, "--total-steps", "128")
     assert re.search(RESULT, said) and "report:" in said
     (line,) = re.findall(r"measure it: bounce-mjx (eval .+)", said)
-    assert shlex.split(line)[2:] == list(task[2:])
+    _, run, *imports = shlex.split(line)
+    assert imports == ["--import", f"{run}/task/{REST.name}"]
     (folder,) = (tmp_path / "runs" / "rest").iterdir()
     assert "rests" in (folder / "report.html").read_text(encoding="utf-8")
     assert re.search(RESULT, command("eval", *task, "--episodes", "4"))
@@ -852,12 +853,14 @@ def test_a_run_keeps_its_task_which_runs_only_if_the_user_imports_it(
 def test_a_command_without_its_import_prints_the_whole_command(
     mine: Path, tmp_path: Path, refused
 ) -> None:
+    """With the run's copy of the code, as what a training prints has it."""
     import_code(mine)
     run_folder = create_run(
         read_preset(None, task="dribble").model_copy(update={"log_dir": tmp_path / "runs"})
     )
     (run_folder / "checkpoints/1").mkdir(parents=True)
     copy = run_folder / "task" / "mine.py"
+    assert imports_of(run_folder) == ["--import", str(copy)]
     for line in (f"eval {run_folder}", f"play {run_folder}", f"train {run_folder} --seed 3"):
         user_code._code_files.clear()
         refused(line, f"import it to run it: bounce-mjx {line} --import {copy}")

@@ -81,7 +81,5 @@ def main(args: Sequence[str] | None = None) -> None:
             # A robot's computer has no pydantic: doctor, which runs there, needs no code of a user.
             command.main(rest)
             return
-        # The user's own tasks and algorithms, which then have names. The two words before the rest
-        # are for the command line that an error advises.
-        _, _, *words = run_imports(["bounce-mjx", name, *rest])
-        command.main(words)
+        # The user's own tasks and algorithms, which then have names.
+        command.main(run_imports(rest, prog=("bounce-mjx", name)))

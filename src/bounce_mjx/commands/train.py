@@ -17,7 +17,7 @@ from bounce_mjx.config.files import dump_with_sources, flat
 from bounce_mjx.config.settings import Count, NonNegativeInt, fields_in
 from bounce_mjx.errors import UserError
 from bounce_mjx.interrupt import in_daemon_thread, leave
-from bounce_mjx.runs.config import TrainConfig
+from bounce_mjx.runs.config import TrainConfig, imports_of
 from bounce_mjx.runs.layers import Layers, layers_on
 from bounce_mjx.runs.presets import default_preset, has_accelerator, has_plugin
 from bounce_mjx.runs.start import Choice, ChoiceFlags, Start, find_start
@@ -202,7 +202,7 @@ def train(command: TrainCommand, settings: Settings) -> None:
         in_daemon_thread(jax.devices)
     from bounce_mjx.training import hosts
     from bounce_mjx.training.events import say
-    from bounce_mjx.training.job import TrainingStopped, imports_of
+    from bounce_mjx.training.job import TrainingStopped
     from bounce_mjx.training.run import run_training
 
     with hosts.leave_on_user_error():
@@ -235,7 +235,8 @@ def train(command: TrainCommand, settings: Settings) -> None:
             # The stop was asked for, and the state is saved. Does not wait for a compilation or an
             # evaluation in another thread.
             leave(0)
-        words = shlex.join([str(run.checkpoint.run), *imports_of(config)])
+        best = run.checkpoint.run
+        words = shlex.join([str(best), *imports_of(best)])
         say(console, f"measure it: bounce-mjx eval {words}")
         say(console, f"watch it: bounce-mjx play {words}")
         if is_watched:

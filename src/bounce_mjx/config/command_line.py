@@ -1,4 +1,8 @@
-"""Command lines from the types of settings: argparse reads words, and pydantic their values."""
+"""Command lines from the types of settings: argparse reads words, and pydantic their values.
+
+The flag of a setting is its dotted key, without a first group of `UNNAMED_GROUPS`: --friction of
+env.friction, --reward.height.weight of env.reward.height.weight (`flag_names`).
+"""
 
 import argparse
 import re
@@ -18,6 +22,9 @@ from bounce_mjx.config.validation import describe
 from bounce_mjx.errors import UserError, suggest
 
 CommandT = TypeVar("CommandT", bound=pydantic.BaseModel)
+
+UNNAMED_GROUPS = ("env", "ppo", "viewing", "goals")
+"""Groups that the flags of their settings do not name."""
 
 # Words for a setting without a value: that of YAML and of the help, and Python's.
 _NO_VALUE = ("null", "None")
@@ -255,7 +262,7 @@ def flag_names(fields: Mapping[str, FieldInfo]) -> dict[str, str]:
     for key in sorted(fields, key=lambda key: "." in key):
         group, dot, name = key.rpartition(".")
         whole = flag_of(group + dot + (_mark(fields[key]).name or name))
-        short = re.sub(r"^--(env|ppo|viewing|goals)\.", "--", whole)
+        short = re.sub(rf"^--({'|'.join(UNNAMED_GROUPS)})\.", "--", whole)
         flag = whole if short in taken else short
         taken.add(flag)
         if fields[key].annotation is bool:

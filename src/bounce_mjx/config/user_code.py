@@ -14,7 +14,7 @@ import shlex
 import sys
 import traceback
 import types
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
@@ -70,18 +70,19 @@ def import_code(place: str | os.PathLike) -> None:
         _run(CodeFile(path, content))
 
 
-def run_imports(command: Sequence[str]) -> list[str]:
+def run_imports(args: Sequence[str], prog: Sequence[str]) -> list[str]:
     """Imports what a command line names with --import; its other words.
 
     Args:
-      command: such as bounce-mjx, eval, RUN, --import, FILE.py.
+      args: such as RUN, --import, FILE.py.
+      prog: the words before these, such as bounce-mjx, eval, for the command that an error advises.
 
     Raises:
       UserError: a place is missing, or cannot be imported.
     """
-    _command[:] = command
+    _command[:] = [*prog, *args]
     others = []
-    words = iter(command)
+    words = iter(args)
     for word in words:
         flag, equals, place = word.partition("=")
         if flag != _FLAG:
@@ -94,7 +95,7 @@ def run_imports(command: Sequence[str]) -> list[str]:
     return others
 
 
-def class_of(name: str, base: type[Kind]) -> type[Kind] | None:
+def class_named(name: str, base: type[Kind]) -> type[Kind] | None:
     """The user's class of a name, of those that were imported; None without one.
 
     Raises:
@@ -135,12 +136,17 @@ def code_file_of(kind: type) -> CodeFile | None:
 def import_flags(*kinds: type) -> list[str]:
     """The flags with which a later command imports these classes again; none for those of the
     package, and of no file."""
-    flags = []
+    paths: list[Path] = []
     for kind in kinds:
         code_file = None if kind.__module__.startswith(_PACKAGE) else code_file_of(kind)
-        if code_file is not None and str(code_file.path) not in flags:
-            flags += [_FLAG, str(code_file.path)]
-    return flags
+        if code_file is not None:
+            paths.append(code_file.path)
+    return flags_to_import(paths)
+
+
+def flags_to_import(files: Iterable[Path]) -> list[str]:
+    """The flags with which a command imports files."""
+    return [word for file in dict.fromkeys(files) for word in (_FLAG, str(file))]
 
 
 def not_imported(source: str, key: str, name: str, file: Path | None) -> UserError:

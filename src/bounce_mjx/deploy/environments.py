@@ -21,7 +21,7 @@ from bounce_mjx.resources import POLICIES, policy_path
 from bounce_mjx.robot.config import is_packaged
 from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.folders import run_of
-from bounce_mjx.runs.worlds import NOMINAL, settings_in_world
+from bounce_mjx.runs.worlds import AS_TRAINED, NOMINAL, World, settings_in_world
 from bounce_mjx.task.registry import (
     DEFAULT,
     find_task,
@@ -61,8 +61,9 @@ def environment(
       start: see `EnvironmentOf`; by default, the task bounce. A word that is both a task and a
         policy, such as catch, is the task.
       world: nominal for the model's own, which is that of a policy by default; training for the
-        worlds that a policy's training sampled, without its curriculum; or a named world's file or
-        name in configs/worlds/.
+        worlds that a policy's training sampled, without its curriculum; as_trained for these as
+        they were, which is that of a task or a config by default; or a named world's file or name
+        in configs/worlds/.
       policy: a policy in place of `start`, or beside its task.
       robot: of a task, a config's file or its name in configs/robots/; or the settings `env.robot`.
       settings: fields of the task's config, on top. A group that is given in part keeps the other
@@ -93,11 +94,11 @@ def environment_config(
     if policy is not None:
         if isinstance(start, WorldConfig):
             raise UserError("a config and a policy both say the environment; give one of them")
-        return _of_policy(policy, start, world, _path(robot), settings)
-    if isinstance(start, WorldConfig):
-        return with_settings(settings_in_world(start, world, _path(robot)), settings)
-    task = find_task(start or DEFAULT) if isinstance(start or DEFAULT, str) else start
-    return with_settings(settings_in_world(task, world, _path(robot)), settings)
+        return _of_policy(policy, start, world or NOMINAL, _path(robot), settings)
+    own = start or DEFAULT
+    task_or_config = find_task(own) if isinstance(own, str) else own
+    config = settings_in_world(task_or_config, world or AS_TRAINED, _path(robot))
+    return with_settings(config, settings)
 
 
 def with_settings(config: WorldConfig, settings: Mapping[str, Any]) -> WorldConfig:
@@ -150,7 +151,7 @@ def _path(robot: str | os.PathLike | None) -> Path | None:
 def _of_policy(
     policy: str | os.PathLike,
     task: str | type[Task] | None,
-    world: str | os.PathLike | None,
+    world: World,
     robot: Path | None,
     settings: Mapping[str, Any],
 ) -> WorldConfig:
@@ -180,7 +181,7 @@ def _of_policy(
             f"the policy {policy} is of the task {name_of_policy}, and the environment of the task "
             f"{name}; leave one of them out"
         )
-    config = with_settings(settings_in_world(trained, world or NOMINAL, robot), settings)
+    config = with_settings(settings_in_world(trained, world, robot), settings)
     check_interface(
         interface_of(trained),
         interface_of(config),

@@ -133,6 +133,8 @@ class Seen(NamedTuple):
     moved: tuple[Moved, ...] = ()
     paddle: tuple[tuple[float, np.ndarray], ...] = ()
     """The paddle's places [3] at the last times, m."""
+    let_go: float = -math.inf
+    """Time by which a hand has let go of the ball, s: no picture from before is of a flight."""
     picture: Picture | None = None
     flights: tuple[Flight, ...] = ()
     """Of each ball."""
@@ -483,7 +485,7 @@ class Samples:
                 "last one; give the newest, and ages by one clock"
             )
             raise Doubt("old_picture", reason)
-        if not seen.paddle:
+        if not seen.paddle or taken < seen.let_go:
             return ()
         paddle = _at(seen.paddle, taken)
         if not seen.flights:

@@ -38,6 +38,8 @@ _HOME_SPEED = 0.3
 _SETTLING = 1.0
 # Horizontal distance of a ball from the paddle's centre at which it is over the paddle, m.
 _OVER = 0.15
+# How long after the word a hand may let go of the ball, s.
+_LETTING_GO = 0.02
 # Measured of the arm alone.
 _OF_ARM = ("joint_angles", "time", "joint_targets", "tool_position", "tool_normal")
 
@@ -175,7 +177,7 @@ class Supervisor:
         return self._progress.waits_for if stop is None else stop.reason
 
     def start(self) -> None:
-        """Starts an episode, at the moment in which the ball is let go.
+        """Starts an episode, as the ball is let go, or up to 20 ms before.
 
         Raises:
           UserError: the arm is not ready, or the ball is seen elsewhere than over the paddle, or in
@@ -190,6 +192,7 @@ class Supervisor:
         self._check_start(progress)
         # A load and the servo hold the arm a little beside its command.
         seen = self._controller.samples.rest(progress.memory.seen, progress.resting_angles)
+        seen = seen._replace(let_go=seen.clock.now + _LETTING_GO)
         memory = self._controller.episode(seen, progress.memory.course)
         self._progress = progress._replace(memory=memory, phase="running")
 

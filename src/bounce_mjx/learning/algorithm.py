@@ -9,22 +9,26 @@ from bounce_mjx.learning.config import PPOConfig
 class Algorithm:
     """Base of every algorithm: of `PPO`, and of a user's own that is no `PPO`, such as SAC or that
     of another library. Once its module is imported, `--algorithm NAME` trains with it: the job
-    evaluates, saves, resumes and reports as it does for PPO."""
+    evaluates, saves, resumes and reports as it does for PPO. Such a class has a `Config` and
+    `make_trainer`; a subclass of `PPO` needs neither.
+    """
 
     Config: ClassVar[type[PPOConfig]] = PPOConfig
-    """Type of the settings: those of PPO, which describe the policy's network, and more; its
-    `batch_steps` are the environment steps of an iteration."""
+    """Type of the settings, which are the group `ppo` of the training's config whatever the
+    algorithm: those of PPO, as they describe the network of every policy and the presets have them,
+    and more. Its `batch_steps` are the environment steps of an iteration."""
 
     @classmethod
     def make_trainer(cls, config: Any, env: Any) -> Any:
-        """What trains: a `training.trainer.Trainer`, or None for the trainer of `PPO`.
+        """What trains: a `training.trainer.Trainer`, whose docstring says what the job calls; None
+        for the trainer of `PPO`, which `job.make_trainer` takes then.
 
         Args:
-          config: of the run, a `TrainConfig`.
-          env: one environment, an `Env`.
+          config: of the run, a `runs.config.TrainConfig`; its `ppo` is of this class's `Config`.
+          env: one environment, an `env.env.Env`, of which the trainer steps as many as it likes.
 
         Raises:
-          UserError: the class has none.
+          UserError: the class has none, or the config does not fit.
         """
         raise UserError(
             f"the algorithm {cls.__name__} has no make_trainer(config, env), which returns a "

@@ -1,6 +1,6 @@
 """Algorithms by name: that of the package, and those of imported code."""
 
-from bounce_mjx.config.user_code import class_of
+from bounce_mjx.config.user_code import class_named
 from bounce_mjx.errors import UserError, shorten
 from bounce_mjx.learning.algorithm import Algorithm
 from bounce_mjx.learning.config import PPO_NAME
@@ -28,4 +28,4 @@ def find_algorithm(name: str) -> type[Algorithm]:
 def own_algorithm(name: str) -> type[Algorithm] | None:
     """The algorithm of imported code that has a name; None for that of the package, and where no
     imported code has one of that name."""
-    return None if name == PPO_NAME else class_of(name, Algorithm)
+    return None if name == PPO_NAME else class_named(name, Algorithm)

@@ -18,7 +18,7 @@ from bounce_mjx.runs.config import (
     RESUMABLE_KEYS,
     ROBOT,
     TrainConfig,
-    code_of,
+    copied_code,
     load_run_config,
 )
 from bounce_mjx.runs.presets import read_config_file
@@ -138,7 +138,7 @@ def _settings(run: Path, config: TrainConfig) -> dict[str, Any]:
     settings = flat(config.model_dump(mode="json", exclude=set(_FREE_KEYS)))
     contents = {}
     for key in ("task", "algorithm"):
-        code = code_of(run, key)
+        code = copied_code(run, key)
         if code is not None:
             contents[key] = code.read_bytes()
     if settings["env.mjcf"] is not None:

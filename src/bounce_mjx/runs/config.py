@@ -9,7 +9,7 @@ from pydantic import Field
 from pydantic.fields import FieldInfo
 
 from bounce_mjx.config.settings import Count, NonNegativeInt, Steps, StrictModel, fields_in
-from bounce_mjx.config.user_code import code_file_of, not_imported
+from bounce_mjx.config.user_code import code_file_of, flags_to_import, not_imported
 from bounce_mjx.config.validation import ConfigT, unknown_key, validate
 from bounce_mjx.errors import UserError, warn_once
 from bounce_mjx.evaluation.config import DEFAULT_SEED
@@ -69,7 +69,8 @@ class TrainConfig(StrictModel):
     task: str = DEFAULT
     """Name of the task."""
     env: pydantic.SerializeAsAny[WorldConfig] = Field(default_factory=_default_env)
-    """The world and the task: the settings of the task's `Config`."""
+    """The settings of the task's `Config`: those that every task has, such as friction
+    (`WorldConfig`), and its own."""
     algorithm: str = PPO_NAME
     """ppo, or the name of an imported subclass of `bounce_mjx.learning.ppo.PPO` or
     `bounce_mjx.learning.algorithm.Algorithm`."""
@@ -255,17 +256,17 @@ def load_run_config(run: Path) -> TrainConfig:
     values = {"task": DEFAULT} | read_config_file(path)
     values.pop(BASE, None)
     sources = _sources_in(values.pop(SOURCES, None))
-    its_task = task_named_by(f"the run {run}", values["task"], code_of(run, "task"))
-    if not is_code_of(its_task, run, "task"):
+    its_task = task_named_by(f"the run {run}", values["task"], copied_code(run, "task"))
+    if not is_as_copied(its_task, run, "task"):
         now = code_file_of(its_task)
         warn_once(
             f"{now.path if now else its_task.__module__} differs from the task that {run} was "
-            f"trained with, {code_of(run, 'task')}"
+            f"trained with, {copied_code(run, 'task')}"
         )
     env = _validate_stored(its_task.Config, values.get("env", {}), path, "env")
     values = values | {"env": env}
     algorithm = own_algorithm(values.get("algorithm", PPO_NAME))
-    if algorithm is not None and is_code_of(algorithm, run, "algorithm"):
+    if algorithm is not None and is_as_copied(algorithm, run, "algorithm"):
         ppo = _validate_stored(algorithm.Config, values.get("ppo", {}), path, "ppo")
         values |= {"ppo": ppo}
     else:
@@ -330,8 +331,9 @@ def _sources_in(stored: Any) -> dict[str, str]:
     return sources
 
 
-def code_of(run: Path, key: str) -> Path | None:
-    """A run's copy of the code of its own task or algorithm; None where a package has it.
+def copied_code(run: Path, key: str) -> Path | None:
+    """The file in a run with a copy of the code of its own task or algorithm; None where a package
+    has it.
 
     Args:
       key: task or algorithm.
@@ -340,9 +342,34 @@ def code_of(run: Path, key: str) -> Path | None:
     return files[0] if files else None
 
 
-def is_code_of(kind: type, run: Path, key: str) -> bool:
-    """Whether a task or an algorithm is the one that a run has a copy of, or that of a package."""
-    copy = code_of(run, key)
+def imports_of(run: Path, *, to_train: bool = False) -> list[str]:
+    """The flags with which a later command about a run imports the user's own code: the run's
+    copies, which are what it was trained with, wherever it is moved to and whatever became of the
+    user's own file since.
+
+    Args:
+      to_train: whether the command trains, for which it also needs the run's own algorithm;
+        whatever acts with the policy needs the task alone.
+    """
+    copies: list[Path] = []
+    for key in ("task", "algorithm") if to_train else ("task",):
+        copy = copied_code(run, key)
+        is_new = copy is not None and all(
+            copy.read_bytes() != other.read_bytes() for other in copies
+        )
+        if is_new:
+            copies.append(copy)
+    return flags_to_import(copies)
+
+
+def is_as_copied(kind: type, run: Path, key: str) -> bool:
+    """Whether the code of a task or an algorithm is as the run has copied it (`copied_code`); True
+    where it has no copy, and for a class without a file.
+
+    Args:
+      kind: the class of the task or algorithm, as it was imported now.
+    """
+    copy = copied_code(run, key)
     now = code_file_of(kind)
     return copy is None or now is None or copy.read_bytes() == now.content
 

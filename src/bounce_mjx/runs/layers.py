@@ -1,7 +1,7 @@
 """The settings of a training, from wherever they come.
 
 One word fixes the classes (`start.py`): which task, which algorithm and which policy or run a
-training begins with. Everything else is values. They are layers, in the order of `ORDER`, and a
+training begins with. Everything else is values. They are layers, in the order of `Rank`, and a
 later one wins.
 
 A resumed run has two: its own config, and what the user says; more steps end its
@@ -12,6 +12,7 @@ merges all of them and validates the result, once; the config then knows what se
 """
 
 import dataclasses
+import enum
 import functools
 import itertools
 import os
@@ -40,19 +41,25 @@ from bounce_mjx.runs.start import Choice, FileFlags, Start, check_not_given, fin
 from bounce_mjx.runs.worlds import Layer, layers_of_environment
 from bounce_mjx.world.named import without_idle_curriculum
 
-ORDER = (
-    "the defaults of the task and of the algorithm",
-    "the preset for this machine",
-    "what your own algorithm changes of PPO's defaults",
-    "a preset that you name, in place of the machine's",
-    "the policy of a warm start: its environment and its networks' settings",
-    "your files and further presets, each on those before it",
-    "a robot: `--robot`, or that of `--world`",
-    "a world: `--world`",
-    "what you say: flags, or arguments of `train`",
-)
-"""The layers of a new training, the lowest first. A robot's file may say something of the training,
-too. A warm start brings its own robot, beside which there is no other."""
+
+class Rank(enum.StrEnum):
+    """The kinds of layers of a new training, the lowest first: a layer wins over those of a lower
+    rank. Each is in the words of docs/config.md. A robot's file may say something of the training,
+    too. A warm start brings its own robot, beside which there is no other."""
+
+    DEFAULTS = "the defaults of the task and of the algorithm"
+    """No layer: what the types of the settings say."""
+    MACHINE = "the preset for this machine"
+    ALGORITHM = "again the defaults of your own algorithm, where they differ from PPO's"
+    PRESET = "a preset that you name, in place of the machine's"
+    WARM_START = "the policy of a warm start: its environment and its networks' settings"
+    FILES = "your files and further presets, each on those before it"
+    ROBOT = "a robot: `--robot`, or that of `--world`"
+    WORLD = "a world: `--world`"
+    USER = "what you say: flags, or arguments of `train`"
+    """Not among `Layers.below`."""
+
+
 FLAGS = "flags"
 """Source of the settings on a command line."""
 PYTHON = "train"
@@ -92,26 +99,23 @@ def layers_on(start: Start, files: FileFlags, machine: Path | None = None) -> "L
     else:
         read = _layers_of_whole(start.whole, start.warm_start)
     changed = _changed_defaults(start.algorithm_config)
-    trained = None if start.policy is None else start.policy.env
+    trained = None if start.warm_config is None else start.warm_config.env
     of_env = layers_of_environment(start.task, trained, files.robot, files.world)
     for layer in of_env.robot:
         _check_start(layer, start)
     policies = [_with_networks(layer, start) for layer in of_env.policy]
     changes = _notes(changed, read.preset, "ppo.") + _notes(read.preset, policies, "env.")
-    return Layers(
-        start=start,
-        # In the order of `ORDER`.
-        below=(
-            *read.machine,
-            *changed,
-            *read.preset,
-            *policies,
-            *read.files,
-            *of_env.robot,
-            *of_env.world,
-        ),
-        notes=(*start.notes, *changes),
-    )
+    layers: dict[Rank, list[Layer]] = {
+        Rank.MACHINE: read.machine,
+        Rank.ALGORITHM: changed,
+        Rank.PRESET: read.preset,
+        Rank.WARM_START: policies,
+        Rank.FILES: read.files,
+        Rank.ROBOT: of_env.robot,
+        Rank.WORLD: of_env.world,
+    }
+    below = [layer for rank in Rank for layer in layers.get(rank, [])]
+    return Layers(start=start, below=tuple(below), notes=(*start.notes, *changes))
 
 
 class ConfigLayers(NamedTuple):
@@ -185,8 +189,8 @@ def _title_of(layers: Sequence[Layer]) -> str:
 
 
 def _changed_defaults(algorithm_config: type[PPOConfig]) -> list[Layer]:
-    """What an algorithm of the user's changes of PPO's defaults: it means these values, unlike a
-    preset that was made for PPO. They are a layer, so that they lie above the machine's preset."""
+    """The defaults of an algorithm of the user's that differ from PPO's (`Rank.ALGORITHM`): it
+    means these values, and the machine's preset below them was made for PPO."""
     changed = {}
     for key, field in PPOConfig.model_fields.items():
         own_field = algorithm_config.model_fields[key]
@@ -220,8 +224,8 @@ def _as_in_yaml(value: Any) -> Any:
 
 def _with_networks(of_env: Layer, start: Start) -> Layer:
     """The layer of the policy of a warm start: its environment, its task and its networks."""
-    networks = start.policy.ppo.model_dump(include={*NETWORK_KEYS, "critic_metrics"})
-    values = of_env.values | {"task": start.policy.task, "ppo": networks}
+    networks = start.warm_config.ppo.model_dump(include={*NETWORK_KEYS, "critic_metrics"})
+    values = of_env.values | {"task": start.warm_config.task, "ppo": networks}
     return of_env._replace(source=f"the warm start {start.warm_start}", values=values)
 
 
@@ -391,7 +395,8 @@ def _merge(layers: Sequence[Layer]) -> tuple[dict[str, Any], dict[str, str]]:
             randomization = without_idle_curriculum(values["env"]["randomization"])
             values["env"] = values["env"] | {"randomization": randomization}
         for key in flat(layer.values):
-            # Put last: `TrainConfig.sources` gives a mapping the source of its last key.
+            # As the last key, by which `TrainConfig.sources` tells the source of a mapping, such as
+            # `shares`, whose entries may have several.
             sources.pop(key, None)
             sources[key] = layer.source
     # A later layer may end a value, or replace a mapping by None.
@@ -452,7 +457,8 @@ def read_preset(
     world: Path | None = None,
     machine: Path | None = None,
 ) -> TrainConfig:
-    """The config of presets, files, a robot and a world: see `Choice` and `read_layers`.
+    """The config of a preset, on which further presets, files, a robot and a world may lie: see
+    `Choice` and `read_layers`.
 
     Args:
       task: by default, the one that the last file names.

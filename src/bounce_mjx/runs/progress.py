@@ -20,6 +20,7 @@ class Progress(pydantic.BaseModel):
     """Evaluations of a run so far."""
 
     best: Report | None = None
+    """The best evaluation so far."""
     fault: str | None = None
     """Which quantity was not finite first, and at which iteration, as a sentence; None unless the
     training diverged."""

@@ -16,9 +16,9 @@ from bounce_mjx.learning.registry import find_algorithm, own_algorithm
 from bounce_mjx.resources import POLICIES, policy_folder
 from bounce_mjx.runs.config import (
     TrainConfig,
-    code_of,
+    copied_code,
     fields_of,
-    is_code_of,
+    is_as_copied,
     load_run_config,
     runs_folder,
 )
@@ -83,10 +83,10 @@ class Start(NamedTuple):
     said: dict[str, Any]
     """What the user names of it, by the keys of the config: the task, the algorithm, the policy of
     a warm start. It wins over every layer."""
-    policy: TrainConfig | None = None
-    """Config of the policy of a warm start."""
     warm_start: Path | None = None
-    """Name of that policy, or its checkpoint's folder."""
+    """The policy of a warm start: its name, or its checkpoint's folder."""
+    warm_config: TrainConfig | None = None
+    """Config of the training of that policy."""
     whole: TrainConfig | None = None
     """A whole config, of Python, whose task and algorithm these are; no preset lies below it."""
     place: Path | None = None
@@ -149,14 +149,14 @@ def _new_start(
     warm_start = named
     if named is None and whole is not None:
         warm_start = whole.warm_start
-    policy: TrainConfig | None = None
+    warm_config: TrainConfig | None = None
     notes: tuple[str, ...] = ()
     if warm_start is not None:
         folder = _folder_of_runs(flags.log_dir, word, whole)
-        warm_start, policy, notes = _policy_of(warm_start, folder)
+        warm_start, warm_config, notes = _policy_of(warm_start, folder)
     if named is not None:
         said["warm_start"] = warm_start
-    task = _task_of(word, whole, policy)
+    task = _task_of(word, whole, warm_config)
     if word is not None:
         said["task"] = task_name(task)
     algorithm_name, algorithm_config = _algorithm(flags.algorithm, whole)
@@ -168,23 +168,28 @@ def _new_start(
         algorithm_config=algorithm_config,
         algorithm_name=algorithm_name,
         said=said,
-        policy=policy,
         warm_start=warm_start,
+        warm_config=warm_config,
         whole=whole,
         notes=notes,
     )
 
 
-def _task_of(word: str | None, whole: TrainConfig | None, policy: TrainConfig | None) -> type[Task]:
+def _task_of(
+    word: str | None, whole: TrainConfig | None, warm_config: TrainConfig | None
+) -> type[Task]:
     """The task that the word names; without one, that of a whole config, of the policy of a warm
     start, or the default.
+
+    Args:
+      warm_config: of the policy of a warm start.
 
     Raises:
       UserError: the word names another task than a whole config, or one that neither extends the
         policy's nor is extended by it.
     """
     if word is None:
-        config = whole or policy
+        config = whole or warm_config
         return find_task(DEFAULT) if config is None else config.env.task
     task = find_task(word)
     if whole is not None and whole.env.task is not task:
@@ -192,11 +197,11 @@ def _task_of(word: str | None, whole: TrainConfig | None, policy: TrainConfig | 
             f"the config is of the task {whole.task}, and the first argument is {word}; leave it "
             "out"
         )
-    if policy is not None:
-        its_task = policy.env.task
+    if warm_config is not None:
+        its_task = warm_config.env.task
         if not (issubclass(task, its_task) or issubclass(its_task, task)):
             raise UserError(
-                f"the warm start is a policy of the task {policy.task}, and this training of "
+                f"the warm start is a policy of the task {warm_config.task}, and this training of "
                 f"{word}; leave {word} out, or give a policy of it"
             )
     return task
@@ -232,15 +237,15 @@ def _start_of_run(word: Path, flags: StartFlags, whole: TrainConfig | None) -> S
     if config.algorithm != PPO_NAME:
         algorithm = own_algorithm(config.algorithm)
         if algorithm is None:
-            code = code_of(run, "algorithm")
+            code = copied_code(run, "algorithm")
             raise not_imported(f"the run {run}", "algorithm", config.algorithm, code)
         classes["algorithm"] = algorithm
     # Its settings are no settings of other code.
     for key, kind in classes.items():
-        if not is_code_of(kind, run, key):
+        if not is_as_copied(kind, run, key):
             raise UserError(
                 f"{run} cannot be resumed with another {key} than it was trained with; import "
-                f"{code_of(run, key)}, or start a new run"
+                f"{copied_code(run, key)}, or start a new run"
             )
     return Start(
         task=config.env.task,

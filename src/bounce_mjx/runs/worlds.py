@@ -20,17 +20,20 @@ from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.named import CURRICULUM, NamedWorld, read_world
 from bounce_mjx.world.randomization import RandomizationConfig
 
-AS_TRAINED = None
-"""World: each that a policy's training sampled, as it did; of a task, that of its defaults. Of a
-policy, `environment` and `Run.env` take `NOMINAL` where no world is given."""
+AS_TRAINED = "as_trained"
+"""World: the start's own, as it is: of a policy, each that its training sampled; of a task, that of
+its defaults."""
 TRAINING = "training"
 """World: each that a policy's training sampled, without its curriculum."""
 NOMINAL = "nominal"
-"""World: the model's own; a task's own."""
+"""World: the model's own; the goals stay as they are. (`EvaluationOptions.nominal`, the flag
+--nominal of `eval`, is this world and fixed goals.)"""
 
-World = str | os.PathLike | RandomizationConfig | None
+World = str | os.PathLike | RandomizationConfig
 """`AS_TRAINED`, `TRAINING` or `NOMINAL`; the file of a named world, or its name in configs/worlds/;
-or, of a policy, the terms of a user's own."""
+or, of a policy, the terms of a user's own. Where a user may leave the world out, `None` is replaced
+by one of these at once: of a policy, `environment` and `Run.env` take `NOMINAL`, `eval` and `play`
+`AS_TRAINED`, `rehearse` `TRAINING`."""
 
 
 class Layer(NamedTuple):
@@ -63,9 +66,7 @@ def settings_in_world(
     start: type[Task] | WorldConfig, world: World, robot: Path | None = None
 ) -> WorldConfig:
     """The settings of the environment of a task, or of a policy's training with its observation and
-    its actions, in a world. Each caller says the world that it takes unless the user names one:
-    what measures a policy `AS_TRAINED`, the rehearsal of one `TRAINING`, and the environment that a
-    user asks for by its policy `NOMINAL`.
+    its actions, in a world.
 
     Args:
       start: a task, or the config of a policy's environment.
@@ -77,7 +78,7 @@ def settings_in_world(
     """
     if isinstance(start, WorldConfig):
         _check_one_robot(start, robot)
-        if world is AS_TRAINED:
+        if world == AS_TRAINED:
             return start
         if world == NOMINAL:
             return start.in_world(RandomizationConfig())

@@ -3,7 +3,7 @@
 import importlib
 import importlib.metadata
 
-from bounce_mjx.config.user_code import class_of, own_name, own_names
+from bounce_mjx.config.user_code import class_named, own_name, own_names
 from bounce_mjx.errors import UserError, reason_of, shorten, suggest
 from bounce_mjx.task.task import Task
 from bounce_mjx.world.config import WorldConfig
@@ -29,7 +29,7 @@ def find_task(name: str) -> type[Task]:
     # Without a look at the installed packages, which takes 10 ms.
     known = _OF_THE_PACKAGE if name in _OF_THE_PACKAGE else registered_tasks()
     if name not in known:
-        own = class_of(name, Task)
+        own = class_named(name, Task)
         if own is not None:
             return own
         names = sorted({*known, *own_names(Task)})
@@ -54,7 +54,7 @@ def find_task(name: str) -> type[Task]:
 
 def is_task(name: str) -> bool:
     """Whether a word is the name of a task."""
-    if name in _OF_THE_PACKAGE or class_of(name, Task) is not None:
+    if name in _OF_THE_PACKAGE or class_named(name, Task) is not None:
         return True
     return name in registered_tasks()
 
@@ -82,7 +82,7 @@ def task_name(task: type[Task]) -> str:
 def own_task(name: str) -> type[Task] | None:
     """The task of imported code that has a name; None for that of a package, and where no imported
     code has one of that name."""
-    return None if name in registered_tasks() else class_of(name, Task)
+    return None if name in registered_tasks() else class_named(name, Task)
 
 
 def task_config(task: str | type[Task]) -> type[WorldConfig]:

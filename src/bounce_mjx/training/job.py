@@ -2,9 +2,13 @@
 
 It is the same for every algorithm whose trainer is a `Trainer`.
 
+A training stops or ends. It stops (`must_stop`) by a signal, or by an exception in a callback: what
+is new is saved, and the run can be resumed. It ends (`ends_here`) by its steps, by a callback that
+returns False, or by its results: then the best policy is evaluated, too.
+
 From a signal to its checkpoint: `StopRequest` notes the signal, the block goes on to its end
 (`train_block`), an evaluation that is due is left out (on several hosts it is done, as a process
-that stopped alone would keep the others waiting), `is_stopping` ends the loop, and `finish` saves
+that stopped alone would keep the others waiting), `must_stop` ends the loop, and `finish` saves
 the state, waits until it is written, and raises `TrainingStopped` with the command that resumes
 the run, also where the signal came as late as the last save. A later Ctrl-C or SIGTERM does what it
 did before the training: in a command, it ends the process at once (`StopRequest`). What was saved
@@ -28,17 +32,16 @@ import jax
 import numpy as np
 from rich.console import Console
 
-from bounce_mjx.config.user_code import import_flags
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.interrupt import Interrupted, StopRequest
 from bounce_mjx.learning.policy import Policy
-from bounce_mjx.learning.registry import find_algorithm, own_algorithm
+from bounce_mjx.learning.registry import find_algorithm
 from bounce_mjx.physics.convergence import solver_warning
 from bounce_mjx.resources import VERSION
 from bounce_mjx.runs import checkpoints, creation, folders
-from bounce_mjx.runs.config import TrainConfig
+from bounce_mjx.runs.config import TrainConfig, imports_of
 from bounce_mjx.runs.progress import PATIENCE, Progress, waits_are_over
 from bounce_mjx.runs.storage import lock_run, writable
 from bounce_mjx.training import events, faults, hosts
@@ -94,7 +97,7 @@ def train(
                     job.evaluate()
                 if job.save_is_due():
                     job.save()
-                if job.is_stopping() or job.is_finished():
+                if job.must_stop() or job.ends_here():
                     break
                 metrics, seconds = job.train_block()
                 job.log_block(metrics, seconds)
@@ -165,20 +168,6 @@ def make_trainer(config: TrainConfig, env: Env) -> Trainer:
     return PPOTrainer(config, env) if own_trainer is None else own_trainer
 
 
-def imports_of(config: TrainConfig, *, to_train: bool = False) -> list[str]:
-    """The flags with which a later command imports the user's own code again.
-
-    Args:
-      to_train: whether the command trains, for which it also needs an algorithm of the user's;
-        whatever acts with the policy needs its task alone.
-    """
-    own: list[type] = [config.env.task]
-    algorithm = own_algorithm(config.algorithm)
-    if to_train and algorithm is not None:
-        own.append(algorithm)
-    return import_flags(*own)
-
-
 @dataclasses.dataclass
 class Job:
     """A training run in progress.
@@ -209,10 +198,10 @@ class Job:
     """Environment steps of each seed so far."""
     needs_save: bool = False
     """Whether there is something new since the last save was started."""
-    callback_has_ended: bool = False
-    """Whether a callback has ended the training."""
+    ended_by_callback: bool = False
+    """Whether a callback has ended the training: it returned False."""
     failure: BaseException | None = None
-    """What a callback raised: it stops the training, as a signal does."""
+    """What a callback raised, which stops the training, as a signal does."""
     failed_callbacks: list[events.Callback] = dataclasses.field(default_factory=list)
     """Those that raised."""
     state: Any = None
@@ -262,7 +251,7 @@ class Job:
         # Every process has read what the leader renames.
         hosts.wait_for_all()
         self.set_damaged_aside()
-        if self.is_finished():
+        if self.ends_here():
             met = "has met all results" if self.ends_by_results() else "has been trained to its end"
             self.say(f"{self.run} {met}, {self.steps:,} steps; add --total-steps N to train on")
 
@@ -349,11 +338,12 @@ class Job:
         """Whether the current policies are to be evaluated."""
         # A finished run that is resumed with a damaged best checkpoint is evaluated again; one that
         # goes on finds another best policy.
-        if self.is_finished() and any(seed.best is None for seed in self.healthy()):
+        if self.ends_here() and any(seed.best is None for seed in self.healthy()):
             return True
         # The policy of a warm start is the one to beat.
         is_worth_it = self.steps > 0 or self.networks is not None
-        is_at_evaluation = self.is_at_its_end() or self.steps % self.eval_steps == 0
+        is_last = self.ends_by_steps() or self.ended_by_callback
+        is_at_evaluation = is_last or self.steps % self.eval_steps == 0
         return is_worth_it and is_at_evaluation and not self.is_evaluated()
 
     def evaluate(self) -> None:
@@ -397,14 +387,15 @@ class Job:
         self.needs_save = False
         self.clock.lap("save")
 
-    def is_stopping(self) -> bool:
-        """Whether a signal has come to any process, or a callback has failed. On several hosts,
-        every process must call this at the same point."""
+    def must_stop(self) -> bool:
+        """Whether a signal has come to any process, or a callback has failed. On several hosts the
+        processes agree on it (`hosts.any_of`), so that every one must call this at the same
+        point."""
         return hosts.any_of(self.stop.requested or self.failure is not None)
 
-    def is_finished(self) -> bool:
-        """Whether the training ends here: at its last step, by a callback, or by its results."""
-        return self.is_at_its_end() or self.ends_by_results()
+    def ends_here(self) -> bool:
+        """Whether the training ends here: by its steps, by a callback, or by its results."""
+        return self.ends_by_steps() or self.ended_by_callback or self.ends_by_results()
 
     def train_block(self) -> tuple[BlockMetrics, float]:
         """Trains for a block of I iterations; its metrics, each [S, I], and its duration, s.
@@ -416,7 +407,7 @@ class Job:
         started = time.perf_counter()
         block = self.pool.submit(self.trainer.train_block)
         if not self.stop.wait_for(block):
-            self.say("stopping after this block; Ctrl-C or SIGTERM ends it at once")
+            self.say("stopping after this block; Ctrl-C or SIGTERM ends the training at once")
         metrics = block.result()
         seconds = time.perf_counter() - started
         if self.steps == 0 and (wrong := faults.first_block_fault(metrics, self.config)):
@@ -461,7 +452,7 @@ class Job:
           UserError: the state could not be saved.
           BaseException: what a callback raised.
         """
-        is_early = self.is_stopping()
+        is_early = self.must_stop()
         # The policy of a warm start is saved once it is evaluated.
         has_nothing = self.is_new and self.steps == 0 and not self.is_evaluated()
         if is_early and has_nothing:
@@ -477,13 +468,13 @@ class Job:
             is_measured = self.evaluate_best()
             where = f", {'after' if is_measured else 'before'} the final evaluation"
         # A signal may have come during the last save, too.
-        is_stopping = self.is_stopping()
+        must_stop = self.must_stop()
         # Every process waits here for the others; after this, none needs another.
         jax.distributed.shutdown()
         if self.failure is not None:
             self.say(f"a callback failed after {self.steps:,} steps; {self.continuing}")
             raise self.failure
-        if is_stopping:
+        if must_stop:
             raise TrainingStopped(
                 f"stopped after {self.steps:,} steps{where}; {self.continuing}{self.report_so_far}"
             )
@@ -538,9 +529,9 @@ class Job:
         """The seeds that have not diverged."""
         return [seed for seed in self.seeds if seed.progress.fault is None]
 
-    def is_at_its_end(self) -> bool:
-        """Whether the last step is reached, or a callback has ended the training."""
-        return self.callback_has_ended or self.steps >= self.config.total_steps
+    def ends_by_steps(self) -> bool:
+        """Whether the last step is reached (`total_steps`)."""
+        return self.steps >= self.config.total_steps
 
     def ends_by_results(self) -> bool:
         """Whether the results end the training (`stop_when_solved`)."""
@@ -549,7 +540,7 @@ class Job:
 
     def why_it_ends(self) -> str:
         """Why the training ends here, in words."""
-        if self.callback_has_ended and self.steps < self.config.total_steps:
+        if self.ended_by_callback and not self.ends_by_steps():
             return f"a callback ended the training after {self.steps:,} steps; {self.continuing}"
         if not self.ends_by_results():
             return f"the training ends after its {self.steps:,} steps (total_steps)"
@@ -613,13 +604,13 @@ class Job:
                     continue
                 # A comparison of NumPy's numbers has its own False.
                 if isinstance(answer, bool | np.bool_) and not answer:
-                    self.callback_has_ended = True
-        self.callback_has_ended = hosts.any_of(self.callback_has_ended)
+                    self.ended_by_callback = True
+        self.ended_by_callback = hosts.any_of(self.ended_by_callback)
 
     @property
     def continuing(self) -> str:
         """The sentence that continues the run."""
-        words = shlex.join([str(self.run), *imports_of(self.config, to_train=True)])
+        words = shlex.join([str(self.run), *imports_of(self.run, to_train=True)])
         return f"continue with: bounce-mjx train {words}"
 
     @property
@@ -629,7 +620,7 @@ class Job:
         if not evaluated:
             return ""
         best = max(evaluated, key=lambda seed: seed.progress.best.score)
-        words = shlex.join([str(best.run), *imports_of(best.config)])
+        words = shlex.join([str(best.run), *imports_of(best.run)])
         return f" (its report so far: bounce-mjx report {words})"
 
     # Signals and faults

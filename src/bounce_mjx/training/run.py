@@ -36,7 +36,7 @@ from bounce_mjx.reports.tables import (
 from bounce_mjx.resources import POLICIES, policy_path
 from bounce_mjx.runs import folders
 from bounce_mjx.runs.checkpoints import read_actor, read_record
-from bounce_mjx.runs.config import TrainConfig, load_run_config
+from bounce_mjx.runs.config import TrainConfig, imports_of, load_run_config
 from bounce_mjx.runs.layers import FLAGS, PYTHON, Layers, layers_on
 from bounce_mjx.runs.progress import load_results
 from bounce_mjx.runs.start import FileFlags, StartFlags, find_start
@@ -333,7 +333,7 @@ def leave_report(seed: job.SeedRun, console: Console) -> None:
       TrainingStopped: a signal came meanwhile.
     """
     started = time.perf_counter()
-    words = shlex.join([str(seed.run), *job.imports_of(seed.config)])
+    words = shlex.join([str(seed.run), *imports_of(seed.run)])
     again = f"draw it with: bounce-mjx report {words}"
     try:
         # Imported during the compilation (`Job.compile`).

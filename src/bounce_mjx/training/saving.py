@@ -148,8 +148,8 @@ class Saver:
         if len(self._seeds) == 1:
             # The best checkpoint stays beside the newest ones, unless this one is the best.
             (seed,) = self._seeds
-            is_best_kept = seed.saved is not None and not seed.has_unsaved_best
-            best = {seed.saved.number} if is_best_kept else set()
+            is_best_kept = seed.saved_best is not None and not seed.has_unsaved_best
+            best = {seed.saved_best.number} if is_best_kept else set()
             return [self._save_of(0, snapshot, progress[0], training, self._kept() | best)]
         saves = []
         for i, seed in enumerate(self._seeds):

@@ -37,16 +37,17 @@ class SeedRun:
     report: Report | None = None
     """The evaluation of the current policy; None before it."""
     best: Best | None = None
-    saved: Best | None = None
+    """The best policy so far; `progress.best` is its report."""
+    saved_best: Best | None = None
     """The best policy of those that were saved."""
     saved_progress: Progress = dataclasses.field(default_factory=Progress)
     """The evaluations that were saved."""
 
     @property
     def has_unsaved_best(self) -> bool:
-        """Whether the best policy is not saved yet. It is the current policy then, as its save
-        starts before the training goes on."""
-        return self.best is not self.saved
+        """Whether the best policy is not saved yet. It is the current policy then: the next save
+        starts before the next block."""
+        return self.best is not self.saved_best
 
     def add_report(self, report: Report, policy: Policy, steps: int, seconds: float) -> None:
         """Adds the evaluation of the current policy.
@@ -70,7 +71,7 @@ class SeedRun:
         """
         if number is not None and self.has_unsaved_best:
             self.best = dataclasses.replace(self.best, number=number)
-            self.saved = self.best
+            self.saved_best = self.best
         if is_saved:
             self.saved_progress = self.progress.copy_so_far()
         elif has_failed:
@@ -78,7 +79,7 @@ class SeedRun:
             self.progress = self.saved_progress.copy_so_far()
             self.progress.fault = fault
         if has_failed:
-            self._take_best(self.saved)
+            self._take_best(self.saved_best)
 
     def recall(self, progress: Progress) -> None:
         """Takes over the evaluations of a checkpoint from which a training resumes."""
@@ -95,14 +96,14 @@ class SeedRun:
         Raises:
           UserError: the checkpoint's config is not that of the seed's folder.
         """
-        self.saved = None
+        self.saved_best = None
         # A seed may have diverged before its first evaluation.
         if folders.stored_checkpoints(self.run):
             try:
-                self.saved = self._read_best(folders.best_checkpoint(self.run, newest=newest))
+                self.saved_best = self._read_best(folders.best_checkpoint(self.run, newest=newest))
             except DamagedCheckpoint as error:
                 warn_once(f"{error.damage}; another policy takes its place")
-        self._take_best(self.saved)
+        self._take_best(self.saved_best)
 
     def _read_best(self, checkpoint: Checkpoint) -> Best | None:
         """The policy of a checkpoint with its evaluation; None if it has none."""

@@ -27,11 +27,12 @@ class Snapshot(NamedTuple):
 
 class Trainer(Protocol):
     """S independent runs of one algorithm, one for each seed, whose policies have the network that
-    the config's `ppo` describes.
+    the config's `ppo` describes (`learning.policy.make_networks`), as evaluations and every command
+    act with it.
 
-    The job asks the algorithm for one (`Algorithm.make_trainer`), which may raise a UserError where
-    the config does not fit. Then it calls `compile`, `start` once, and `train_block` for each
-    block. It may ask for `state_template` at any time, and after `start` for a `snapshot`.
+    The job asks the algorithm for one (`learning.algorithm.Algorithm.make_trainer`). Then it calls
+    `compile` and `start`, once each, and `train_block` for each block. It may ask for
+    `state_template` at any time, and after `start` for a `snapshot`. `PPOTrainer` is one.
     """
 
     checked: Sequence[str]
