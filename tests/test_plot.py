@@ -162,6 +162,11 @@ def test_a_label_has_words_of_the_user(tmp_path: Path) -> None:
         (runs[-1] / "algorithm/other.py").write_text(own)
     labels = [group.label for group in group_runs(runs[::2])]
     assert labels == ["height.weight 1.0 (one run)", "height.weight 2.0 (one run)"]
+    scaled = TrainConfig(env=BounceConfig(reward={"position": {"base_scale": 0.4}}))
+    pair = []
+    for name, config in (("scaled", scaled), ("usual", TrainConfig())):
+        pair.append(write_run(tmp_path / name, config, {"episode/return": {1: 1.0}}))
+    assert group_runs(pair)[0].label == "position.base_scale 0.4 (one run)"
     labels = [group.label for group in group_runs(runs[:2])]
     assert all(re.fullmatch(r"algorithm other [0-9a-f]{8} \(one run\)", label) for label in labels)
     assert len(set(labels)) == 2

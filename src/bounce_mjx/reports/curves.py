@@ -228,9 +228,10 @@ def _label(config: TrainConfig, settings: dict[str, Any], shown: Sequence[str], 
 
 def _short_name(key: str, settings: dict[str, Any]) -> str:
     """The fewest last words of a setting's dotted name that no other setting ends with, such as
-    height.weight."""
+    num_envs; two of one in a group's group, such as that of a reward term: height.weight."""
     words = key.split(".")
-    for count in range(1, len(words)):
+    fewest = 2 if len(words) > 3 else 1
+    for count in range(fewest, len(words)):
         name = ".".join(words[-count:])
         if sum(other == name or other.endswith(f".{name}") for other in settings) == 1:
             return name
