@@ -413,6 +413,7 @@ def test_each_result_that_is_not_judged_is_explained() -> None:
         (98.99, ">= 99", False, "98.99"),
         (99.004, ">= 99", True, "99.004"),
         (99.0, ">= 99", True, "99.00"),
+        (1.4997154, "0.1 to 1.5 (targets 0.4 to 0.6 only)", True, "1.4997"),
         (1.5004, "0.1 to 1.5 (targets 0.4 to 0.6 only)", False, "1.5004"),
         (None, ">= 99", False, "-"),
     ],

@@ -18,15 +18,23 @@ def figure_text(value: float | None, spec: str = ".2f") -> str:
     return "-" if value is None else f"{value:{spec}}"
 
 
-def result_text(result: Result, spec: str = ".2f") -> str:
-    """A result's value as text, with more digits where it would read as its bound: 98.997 is no
-    99.00 that misses 99."""
-    text = figure_text(result.value, spec)
-    if result.value is None:
-        return text
+def result_text(result: Result, digits: int = 2, form: str = "f") -> str:
+    """A result's value as text, with as many more digits as it takes not to read as its bound:
+    98.997 is no 99.00 that misses 99.
+
+    Args:
+      digits: precision otherwise.
+      form: format of a number, f or g.
+    """
+    value = result.value
+    if value is None:
+        return figure_text(value)
     limits = [float(number) for number in re.findall(r"\d+(?:\.\d+)?", result.bound)]
-    reads_as_limit = float(text) in limits and float(text) != result.value
-    return f"{result.value:.8g}" if reads_as_limit else text
+    text = f"{value:.{digits}{form}}"
+    while float(text) in limits and float(text) != value:
+        digits += 1
+        text = f"{value:.{digits}{form}}"
+    return text
 
 
 def count_text(count: float) -> str:
