@@ -96,6 +96,7 @@ MISTAKES = (
         "train --reward.height.weight three",
         "--reward.height.weight is three, but must be a valid number (",
     ),
+    ("train --randomization.ball-mass 0.5", "ball_mass: 0.5 is not a range; give two numbers"),
     ("train --target-height-range 0.5", "target_height_range: 0.5 is not a range; give two"),
     ("eval pretrained --robot ur5e", "give mirror"),
     ("eval pretrained --log-dir typo", "--log-dir is where the newest run is looked for, and pret"),

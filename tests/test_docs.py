@@ -53,6 +53,7 @@ PAGES = [
     CHECKOUT / "CONTRIBUTING.md",
     *sorted((CHECKOUT / "docs").rglob("*.md")),
 ]
+RECORDS = [CHECKOUT / "CHANGELOG.md", *sorted((CHECKOUT / "benchmarks").glob("*.md"))]
 
 
 def page_id(page: Path) -> str:
@@ -85,7 +86,7 @@ def anchors(page: Path) -> set[str]:
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
-@pytest.mark.parametrize("page", PAGES, ids=page_id)
+@pytest.mark.parametrize("page", PAGES + RECORDS, ids=page_id)
 def test_links_resolve_and_pictures_have_a_description(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
     for description, picture in re.findall(r"!\[([^]]*)\]\(([^)]+)\)", text):

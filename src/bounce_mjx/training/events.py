@@ -133,7 +133,7 @@ def evaluation_line(config: TrainConfig, steps: int, reports: Sequence[Report]) 
     missing = f", {sure} with a margin"
     if config.num_seeds == 1:
         (report,) = reports
-        figures = (f"{r.name} {result_text(r, '.4g')}" for r in report.results)
+        figures = (f"{r.name} {result_text(r, 4, 'g')}" for r in report.results)
         line = f"{report.summary} ({', '.join(figures)})"
         missing = ", not yet with a margin"
     kind = "evaluation"
