@@ -16,7 +16,7 @@ from bounce_mjx.commands.main import main as console_script
 from bounce_mjx.commands.play import PlayCommand
 from bounce_mjx.commands.train import fields_of_command
 from bounce_mjx.commands.which_policy import film_command
-from bounce_mjx.config.command_line import flags_of, parse
+from bounce_mjx.config.command_line import all_flags, parse
 from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.folders import choose_checkpoint
@@ -284,7 +284,7 @@ def test_the_help_of_a_training_is_one_screen_and_the_whole_help_has_every_flag(
     assert "--num-envs INT          Environments that run in parallel (default: 512)" in pages[0]
     shown = {*re.findall(r"^  (--[\w.-]+)", pages[1], re.MULTILINE)}
     shown |= {*re.findall(r"^  --.+, (--no-[\w.-]+)", pages[1], re.MULTILINE)}
-    known = {*flags_of(fields_of_command(find_start(None, StartFlags())))}
+    known = {*all_flags(fields_of_command(find_start(None, StartFlags())))}
     assert shown == known
     assert pages[1].index("\nppo:\n") < pages[1].index("--learning-rate FLOAT")
 

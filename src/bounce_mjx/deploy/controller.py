@@ -131,8 +131,8 @@ class Controller:
                     name: value + left / steps * (earlier.get(name, value) - value)
                     for name, value in measured.items()
                 }
-            picture = memory.seen.picture if left == 0 else None
-            history, new_action = self.network.step(history, between, action, picture)
+            seen = None if left else memory.seen
+            history, new_action = self.network.step(history, between, action, seen)
         if angles is not None:
             course = self.course_of(course, angles, new_action)
         return Memory(memory.seen, history, new_action, measured, course)
@@ -148,5 +148,5 @@ class Controller:
         base = angles
         lead = self.metadata.max_lead
         if lead is not None:
-            base = np.clip(course.end.position, angles - lead, angles + lead)
+            base = np.minimum(np.maximum(course.end.position, angles - lead), angles + lead)
         return self.motion.aim(course, base + self.metadata.action_scale * action)

@@ -229,7 +229,6 @@ def _check_goal(name: str, value: float, ends: tuple[float, float], unit: str) -
 def _array(label: str, value: Any, size: int, unit: str, limit: float, rows: int = 1) -> np.ndarray:
     """A copy of a user's numbers, which may come in rows, as an array [size]; UserError for another
     shape or kind, or numbers beyond a limit. Hidden entries of a masked array are not finite."""
-    count = "one number" if size == 1 else f"{size} numbers"
     is_masked = isinstance(value, np.ma.MaskedArray)
     try:
         array = value if is_masked else np.asarray(value)
@@ -238,14 +237,18 @@ def _array(label: str, value: Any, size: int, unit: str, limit: float, rows: int
             raise TypeError
         array = array.astype(float)
     except (TypeError, ValueError, OverflowError) as error:
-        raise UserError(f"{label} is {str(value)[:100]!r}; give {count} ({unit})") from error
+        raise UserError(f"{label} is {str(value)[:100]!r}; give {_count(size)} ({unit})") from error
     if array.shape not in ((size,), (rows, size // rows)) and not (size == 1 and not array.shape):
-        raise UserError(f"{label} has the shape {list(array.shape)}; give {count} ({unit})")
+        raise UserError(f"{label} has the shape {list(array.shape)}; give {_count(size)} ({unit})")
     if is_masked:
         array = np.ma.filled(array, np.nan)
     array = array.reshape(size)
-    sizes = np.abs(array)
-    if not sizes.max() <= limit + 1e-6:
-        wrong = array[~(sizes <= limit + 1e-6)]
-        raise UserError(f"{label} holds {wrong[0]}; give finite numbers ({unit})")
+    # Of so few numbers, Python's comparisons are the faster.
+    for number in array.tolist():
+        if not abs(number) <= limit + 1e-6:
+            raise UserError(f"{label} holds {number}; give finite numbers ({unit})")
     return array
+
+
+def _count(size: int) -> str:
+    return "one number" if size == 1 else f"{size} numbers"

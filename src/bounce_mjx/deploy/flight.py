@@ -10,6 +10,7 @@ which is a camera that was bumped, or another ball from a picture on. All are pr
 vector, so that noise is as large in each, and one bound holds for all.
 """
 
+import bisect
 import math
 from typing import NamedTuple
 
@@ -60,19 +61,15 @@ class Near(NamedTuple):
 
     since: float
     """The time of its first picture, s."""
-    times: np.ndarray
-    """Of the pictures in the last 0.4 s [N], s."""
-    places: np.ndarray
-    """Of the ball in them [N, 3], m."""
+    pictures: np.ndarray
+    """The time (s) and the ball's place (m) of those in the last 0.4 s [N, 4]."""
 
 
 class Flight(NamedTuple):
     """The pictures of a ball since it was last near the paddle."""
 
-    times: np.ndarray
-    """When they were taken [N], s."""
-    places: np.ndarray
-    """[N, 3], m."""
+    pictures: np.ndarray
+    """The time (s) and the ball's place (m) of those in the last 0.25 s [N, 4]."""
     height: float
     """Of the last one above the paddle, m."""
     is_over: bool
@@ -135,25 +132,29 @@ def fit_fall(times: np.ndarray, places: np.ndarray, noise: float, push: float = 
     count = len(times)
     if count < 3:
         return Fit(0.0, False)
-    t = times - times.sum() / count
-    spread = float(t @ t)
-    bend = t * t - spread / count
-    # The fall is the bend, less its mean.
-    left = places - places.sum(axis=0) / count
-    left[:, 2] += 0.5 * GRAVITY * bend
-    velocity = (t @ left) / spread
-    left -= t[:, None] * velocity
-    bend -= t * ((t @ bend) / spread)
-    bend_size = math.sqrt(bend @ bend)
-    squared_speed = float(velocity @ velocity) + GRAVITY**2 * spread / count
+    # From the newest picture on, and without the fall a ball's places lie on a line over time.
+    columns = np.empty((count, 6))
+    columns[:, 0] = 1.0
+    columns[:, 1] = t = times - times[-1]
+    columns[:, 2] = squares = t * t
+    columns[:, 3:] = places - places[-1]
+    columns[:, 5] += 0.5 * GRAVITY * squares
+    means, slopes, sizes, spread = _lines((columns.T @ columns).tolist(), count)
+    mean_time = means[0]
+    bend_size, *whole = sizes
+    vx, vy, vz = slopes[1:]
+    squared_speed = vx**2 + vy**2 + (vz - GRAVITY * mean_time) ** 2 + GRAVITY**2 * spread / count
     bound = _DEVIATIONS * math.sqrt(noise**2 + _TIMING**2 * squared_speed)
     at_rest = 0.5 * GRAVITY * bend_size
     is_known = at_rest > _DEVIATIONS * noise
     # No projection is longer than the whole, which mostly is short enough.
-    whole = np.sqrt((left * left).sum(axis=0)).tolist()
     most = math.hypot(*whole) / bound
     if most <= 1.0:
         return Fit(most, is_known)
+    t = t - mean_time
+    residuals = columns[:, 2:] - means[1:] - t[:, None] * slopes
+    bend = residuals[:, 0]
+    left = residuals[:, 1:]
     along = (bend @ left / bend_size).tolist()
     drag = 0.5 * _DRAG * squared_speed
     alone_bound = bound + drag * float(np.abs(bend).max())
@@ -172,6 +173,32 @@ def fit_fall(times: np.ndarray, places: np.ndarray, noise: float, push: float = 
         math.hypot(steps[0], steps[1]) / along_pushed,
     )
     return Fit(ratio, is_known)
+
+
+def _lines(
+    products: list[list[float]], count: int
+) -> tuple[list[float], list[float], list[float], float]:
+    """Least squares in 1 and t of some columns over a number of pictures.
+
+    Args:
+      products: sums of the products of each two of the columns 1, t, and these.
+
+    Returns:
+      The means of t and of the columns; the slopes of the columns, the sizes of what is left of
+      them, and the sum of the squares of t less its mean.
+    """
+    totals = products[0]
+    means = [total / count for total in totals[1:]]
+    spread = products[1][1] - totals[1] * means[0]
+    slopes = []
+    sizes = []
+    for column in range(2, len(totals)):
+        slope = (products[1][column] - totals[column] * means[0]) / spread
+        square = products[column][column] - totals[column] * means[column - 1]
+        slopes.append(slope)
+        # Rounding may take it a little below 0.
+        sizes.append(math.sqrt(max(square - slope**2 * spread, 0.0)))
+    return means, slopes, sizes, spread
 
 
 def _along_steps(t: np.ndarray, spread: float, left: np.ndarray) -> np.ndarray:
@@ -198,7 +225,7 @@ def begin(time: float, place: np.ndarray, paddle: np.ndarray) -> Flight:
       place: of the ball [3], m.
       paddle: the paddle's centre then [3], m.
     """
-    return Flight(np.array([time]), place[None], float(place[2] - paddle[2]), False, None)
+    return Flight(_picture(time, place), float(place[2] - paddle[2]), False, None)
 
 
 def follow(
@@ -212,63 +239,73 @@ def follow(
       place: of the ball [3], m.
       paddle: the paddle's centre then [3], m.
     """
-    since = time - flight.times[-1]
+    last_time, *last_place = flight.pictures[-1].tolist()
+    since = time - last_time
     x, y, height = (place - paddle).tolist()
-    moved = math.dist(place, flight.places[-1])
+    moved = math.dist(place.tolist(), last_place)
     reach = bounds.speed * max(since, bounds.dt) + _DEVIATIONS * math.sqrt(2.0) * bounds.noise
     if moved > reach:
         reason = f"is {moved:.3g} m from {1e3 * since:.0f} ms before, farther than it flies"
         return flight, reason
     is_over = math.hypot(x, y) < _REACH
     low = height + flight.height - 2.0 * _TOUCH < _IMPACT_SPEED * since
-    if low and is_over and (flight.is_over or len(flight.times) == 1):
-        return _touching(bounds, flight, time, place, height)
-    first = int(np.searchsorted(flight.times, time - _WINDOW, side="right"))
-    times = np.concatenate([flight.times[first:], [time]])
-    places = np.concatenate([flight.places[first:], place[None]])
-    fit = fit_fall(times, places, bounds.noise, bounds.push)
+    if low and is_over and (flight.is_over or len(flight.pictures) == 1):
+        return _touching(bounds, flight, _picture(time, place), height)
+    pictures = _followed(flight.pictures, _picture(time, place), _WINDOW)
+    fit = fit_fall(pictures[:, 0], pictures[:, 1:], bounds.noise, bounds.push)
     if fit.ratio > 1.0:
-        seconds = times[-1] - times[0]
+        seconds = time - pictures[0, 0]
         return flight, f"has not fallen as a ball does for {1e3 * seconds:.0f} ms"
     # A ball at which the paddle swings comes and goes, and has left when it is seen to fall.
-    near = None if fit.is_known or flight.near is None else _still_near(flight.near, time, place)
-    return Flight(times, places, height, is_over, near), None
+    near = None
+    if flight.near is not None and not fit.is_known:
+        near = _still_near(flight.near, pictures[-1:])
+    return Flight(pictures, height, is_over, near), None
+
+
+def _picture(time: float, place: np.ndarray) -> np.ndarray:
+    """A picture's time (s) and its ball's place [3] (m) [1, 4]."""
+    return np.array([[time, *place.tolist()]])
+
+
+def _followed(pictures: np.ndarray, newest: np.ndarray, duration: float) -> np.ndarray:
+    """Pictures [N, 4] with another one [1, 4], of a duration, s."""
+    first = bisect.bisect_right(pictures[:, 0], newest[0, 0] - duration)
+    return np.concatenate([pictures[first:], newest])
 
 
 def _touching(
-    bounds: FlightBounds, flight: Flight, time: float, place: np.ndarray, height: float
+    bounds: FlightBounds, flight: Flight, picture: np.ndarray, height: float
 ) -> tuple[Flight, str | None]:
-    """A picture before which the ball may have touched the paddle: a new flight begins."""
+    """A picture [1, 4] before which the ball may have touched the paddle: a new flight begins."""
     near = flight.near
     if near is None:
-        near = Near(float(flight.times[-1]), flight.times[-1:], flight.places[-1:])
-    near = _still_near(near, time, place)
+        near = Near(float(flight.pictures[-1, 0]), flight.pictures[-1:])
+    near = _still_near(near, picture)
     if _goes_to_and_fro(near, bounds.noise):
         return flight, "goes to and fro, as two things would that look like it"
-    if not bounds.may_rest and len(near.times) >= _FEW:
-        seconds = time - near.since
+    if not bounds.may_rest and len(near.pictures) >= _FEW:
+        seconds = float(picture[0, 0]) - near.since
         if seconds > _HELD and _is_straight(near, bounds.noise):
             reason = f"has been near the paddle for {seconds:.2g} s as if it were held there"
             return flight, reason
         if seconds > _LEAVING:
             reason = f"has been near the paddle for {seconds:.2g} s, where it bounces off"
             return flight, reason
-    return Flight(np.array([time]), place[None], height, True, near), None
+    return Flight(picture, height, True, near), None
 
 
-def _still_near(near: Near, time: float, place: np.ndarray) -> Near:
-    """With one more picture."""
-    kept = near.times > time - _HELD
-    times = np.append(near.times[kept], time)
-    places = np.vstack([near.places[kept], place])
-    return Near(near.since, times, places)
+def _still_near(near: Near, picture: np.ndarray) -> Near:
+    """With one more picture [1, 4]."""
+    return Near(near.since, _followed(near.pictures, picture, _HELD))
 
 
 def _is_straight(near: Near, noise: float) -> bool:
     """Whether the heights are those of a constant velocity, but for a noise (m)."""
-    count = len(near.times)
-    t = near.times - near.times.mean()
-    heights = near.places[:, 2]
+    count = len(near.pictures)
+    times = near.pictures[:, 0]
+    t = times - times.mean()
+    heights = near.pictures[:, 3]
     left = heights - heights.mean()
     left -= t * ((t @ left) / (t @ t))
     # The root mean square of n values of deviation 1 has a deviation of 1 / sqrt(2 n).
@@ -279,10 +316,10 @@ def _is_straight(near: Near, noise: float) -> bool:
 def _goes_to_and_fro(near: Near, noise: float) -> bool:
     """Whether most of the last pictures lie beside the way of a ball between their neighbours, seen
     from above, but for a noise (m): they are of two things."""
-    if len(near.times) < _NEIGHBOURS:
+    if len(near.pictures) < _NEIGHBOURS:
         return False
-    times = near.times[-_NEIGHBOURS:]
-    places = near.places[-_NEIGHBOURS:, :2]
+    times = near.pictures[-_NEIGHBOURS:, 0]
+    places = near.pictures[-_NEIGHBOURS:, 1:3]
     duration = times[2:] - times[:-2]
     share = ((times[1:-1] - times[:-2]) / duration)[:, None]
     chord = places[2:] - places[:-2]

@@ -2,13 +2,14 @@
 of the measurements. The world's quantities are the NumPy twin of `world/sensing.py`; a test
 compares the two."""
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from bounce_mjx.deploy.metadata import IS_FIRST, NEWEST, NEXT, Metadata, from_entries
 from bounce_mjx.deploy.motion import paddle_position
-from bounce_mjx.deploy.samples import Measurements, Picture
+from bounce_mjx.deploy.samples import Measurements, Picture, Seen
 from bounce_mjx.errors import UserError, needed
 
 _LOG_ERRORS_ONLY = 3
@@ -42,9 +43,49 @@ class History(NamedTuple):
     """Whether it has seen nothing."""
     remembered: dict[str, np.ndarray]
     """What the task remembers, by the names of the inputs."""
-    quantities: dict[str, np.ndarray]
-    """The last values [history, size] of the observed quantities, the newest first."""
+    values: np.ndarray
+    """The last values of the measured inputs (`_Windows`); empty before the first step."""
     view: View | None = None
+
+
+class _Windows:
+    """The inputs that are measured, in one array of values: one input after another, each with its
+    quantity's last values, the newest first."""
+
+    def __init__(self, shapes: dict[str, tuple[int, ...]]):
+        """Windows of the inputs' shapes: [history, size], or [size] of a newest value alone."""
+        sizes = {name.removeprefix(NEWEST): shape[-1] for name, shape in shapes.items()}
+        self.quantities = tuple(sizes)
+        """Their names, in the order of the newest values."""
+        starts = dict(zip(sizes, np.cumsum([0, *sizes.values()]), strict=False))
+        num_newest = sum(sizes.values())
+        self._places = {}
+        filled = []
+        shifted = []
+        start = 0
+        for name, shape in shapes.items():
+            end = start + math.prod(shape)
+            self._places[name] = slice(start, end), (1, *shape)
+            newest = starts[name.removeprefix(NEWEST)] + np.arange(shape[-1])
+            filled.append(np.resize(newest, end - start))
+            shifted += [newest, num_newest + np.arange(start, end - shape[-1])]
+            start = end
+        # Where each value comes from: the newest ones in a first step; then also the last step's,
+        # after them.
+        self._filled = np.concatenate(filled)
+        self._shifted = np.concatenate(shifted)
+
+    def filled(self, newest: np.ndarray) -> np.ndarray:
+        """The values of a first step, which repeats its newest ones."""
+        return newest[self._filled]
+
+    def shifted(self, values: np.ndarray, newest: np.ndarray) -> np.ndarray:
+        """The values of a step after others."""
+        return np.concatenate([newest, values])[self._shifted]
+
+    def parts(self, values: np.ndarray) -> dict[str, np.ndarray]:
+        """The inputs [1, history, size] or [1, size] in an array of values."""
+        return {name: values[place].reshape(shape) for name, (place, shape) in self._places.items()}
 
 
 class OnnxNetwork:
@@ -73,15 +114,15 @@ class OnnxNetwork:
                 self._remembered[output.name.removeprefix(NEXT)] = _zeros(output)
         # A task that does not look at the value before has an output without an input.
         self._read_again = [name for name in self._remembered if name in self._inputs]
-        self._sizes = {}
+        shapes = {}
         for part in self.metadata.observation:
             if part.name not in self._remembered:
-                self._sizes[part.name] = (part.history, part.size)
-        self._measured = []
-        for name in self._inputs:
+                shapes[part.name] = part.history, part.size
+        for name, entry in self._inputs.items():
             if name.startswith(NEWEST):
-                self._measured.append(name.removeprefix(NEWEST))
-        self.reads = {*self._measured, *self._sizes}
+                shapes[name] = tuple(entry.shape[1:])
+        self._windows = _Windows(shapes)
+        self.reads = frozenset(self._windows.quantities)
         """Names of the quantities that the action depends on."""
         balls = np.zeros(3 * self.metadata.num_balls)
         self._unknown = {
@@ -92,15 +133,14 @@ class OnnxNetwork:
 
     def begin(self) -> History:
         """The history before the first step."""
-        quantities = {name: np.zeros(size) for name, size in self._sizes.items()}
-        return History(is_first=True, remembered=self._remembered, quantities=quantities)
+        return History(is_first=True, remembered=self._remembered, values=np.zeros(0))
 
     def step(
         self,
         history: History,
         measured: Measurements,
         action: np.ndarray,
-        picture: Picture | None = None,
+        seen: Seen | None = None,
     ) -> tuple[History, np.ndarray]:
         """The history after a control step, and its action [J]. The first step fills the whole
         history.
@@ -112,36 +152,38 @@ class OnnxNetwork:
             goals [1], and so on; of several balls one after another, [6] or [9]; units m, rad
             and s.
           action: that of the step before [J].
-          picture: the balls' newest one, of which a velocity from differences is made.
+          seen: what the samples say, the measured one included: the paddle's place, and the balls'
+            newest picture, of which a velocity from differences is made. None for a step between
+            two samples.
 
         Raises:
           NoAction: the network gives no finite action.
         """
         view = history.view
-        if self.metadata.velocity == "differences" and picture is not None:
-            view = self._look(view, picture)
-        if self.metadata.velocity == "differences" and view is not None:
-            measured = measured | {"ball_velocity": view.velocity}
-        newest = self._newest(measured, action)
-        rows = {name: history.remembered[name] for name in self._read_again}
-        quantities = {}
-        for name, values in history.quantities.items():
-            if history.is_first:
-                quantities[name] = np.broadcast_to(newest[name], values.shape)
-            else:
-                quantities[name] = np.concatenate([newest[name][None], values[:-1]])
-            rows[name] = quantities[name][None].astype(np.float32)
-        for name in self._measured:
-            rows[NEWEST + name] = newest[name][None].astype(np.float32)
+        if self.metadata.velocity == "differences":
+            if seen is not None and seen.picture is not None:
+                view = self._look(view, seen.picture)
+            if view is not None:
+                measured = measured | {"ball_velocity": view.velocity}
+        quantities = self._newest(measured, action, seen)
+        newest = np.concatenate([quantities[name] for name in self._windows.quantities])
+        if history.is_first:
+            values = self._windows.filled(newest)
+        else:
+            values = self._windows.shifted(history.values, newest)
+        rows = self._windows.parts(values.astype(np.float32))
+        rows |= {name: history.remembered[name] for name in self._read_again}
         if IS_FIRST in self._inputs:
             rows[IS_FIRST] = np.array([history.is_first])
-        result, *values = self._session.run(self._outputs, rows)
+        result, *remembered = self._session.run(self._outputs, rows)
         if not np.isfinite(result).all():
             raise NoAction("the network returned an action that is not finite; stop the robot")
-        remembered = dict(zip(self._remembered, values, strict=True))
-        return History(False, remembered, quantities, view), result[0].astype(float)
+        remembered = dict(zip(self._remembered, remembered, strict=True))
+        return History(False, remembered, values, view), result[0].astype(float)
 
-    def _newest(self, measured: Measurements, action: np.ndarray) -> Measurements:
+    def _newest(
+        self, measured: Measurements, action: np.ndarray, seen: Seen | None
+    ) -> Measurements:
         """The newest value of each quantity."""
         newest = self._unknown | measured | {"past_actions": action}
         # Their names in the graph: the action as a measurement, and the picture's position, which
@@ -149,7 +191,10 @@ class OnnxNetwork:
         newest["action"] = action
         newest["ball_picture"] = newest["ball_position"]
         if "paddle_position" in self.reads:
-            paddle = paddle_position(self.metadata, newest["joint_angles"])
+            if seen is None:
+                paddle = paddle_position(self.metadata, newest["joint_angles"])
+            else:
+                paddle = seen.paddle[-1][1]
             newest["paddle_position"] = paddle
         return newest
 
@@ -169,7 +214,7 @@ class OnnxNetwork:
         quantity first; empty before the first step."""
         if history.is_first:
             return np.zeros(0)
-        values = history.quantities | history.remembered
+        values = self._windows.parts(history.values) | history.remembered
         return np.concatenate([values[part.name].ravel() for part in self.metadata.observation])
 
 

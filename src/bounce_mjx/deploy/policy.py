@@ -51,7 +51,7 @@ class DeployedPolicy:
             memory = self.controller.begin()
             trial = self._trial()
             for _ in range(2):
-                memory = self.controller.act(memory, trial, 1)
+                memory, _ = self.controller.step(memory, trial)
         except MissingPackage:
             raise
         # onnxruntime raises exceptions of many types for a damaged file.
@@ -67,6 +67,8 @@ class DeployedPolicy:
         metadata = self._network.metadata
         trial = {name: np.zeros(size) for name, size in measurement_sizes(metadata).items()}
         trial |= {name: np.array([c.range[0]]) for name, c in metadata.goals.items()}
+        # Each is a control step after the last one.
+        del trial["time"]
         return trial | {"joint_angles": np.array(metadata.default_joint_angles)}
 
     def _use(self, driver: Driver) -> None:

@@ -132,7 +132,7 @@ class Seen(NamedTuple):
     """Of the arm's last believed sample, s."""
     moved: tuple[Moved, ...] = ()
     paddle: tuple[tuple[float, np.ndarray], ...] = ()
-    """The paddle's places [3] at the last times, m."""
+    """The paddle's places [3] (m) at the last times (s), the last one by the believed angles."""
     let_go: float = -math.inf
     """Time by which a hand has let go of the ball, s: no picture from before is of a flight."""
     picture: Picture | None = None
@@ -265,15 +265,17 @@ class Samples:
             moved = self._moved(seen, measured)
         except Doubt as doubt:
             return self._bridge_values(seen, measured, "arm", _OF_ARM, doubt, elapsed)
-        seen = self._believe(seen, measured, _OF_ARM)
         now = seen.clock.now
-        way = ((now, paddle_position(self._metadata, angles)),)
-        if seen.paddle and seen.paddle[-1][0] == now:
-            way = ()
+        paddle = seen.paddle
+        if paddle and paddle[-1][0] == now:
+            # The first sample of an arm that rests, or another one at the same time.
+            paddle = paddle[:-1]
+        paddle = (*paddle, (now, paddle_position(self._metadata, angles)))
         return seen._replace(
+            values=_believed(seen, measured, _OF_ARM),
             arm_time=now,
             moved=moved,
-            paddle=_recent(seen.paddle + way, now - _PADDLE_WAY),
+            paddle=_recent(paddle, now - _PADDLE_WAY),
         )
 
     def _moved(self, seen: Seen, measured: Measurements) -> tuple[Moved, ...]:
@@ -431,10 +433,12 @@ class Samples:
                 flights = self._follow(seen, balls, taken)
         except Doubt as doubt:
             return self._bridge_values(seen, measured, "ball", _OF_BALL, doubt, elapsed)
-        if is_new:
-            interval = self._dt if last is None else taken - last.taken
-            seen = seen._replace(picture=Picture(balls, taken, interval), flights=flights)
-        return self._believe(seen, measured, _OF_BALL)
+        values = _believed(seen, measured, _OF_BALL)
+        if not is_new:
+            return seen._replace(values=values)
+        interval = self._dt if last is None else taken - last.taken
+        picture = Picture(balls, taken, interval)
+        return seen._replace(values=values, picture=picture, flights=flights)
 
     def _is_later(self, seen: Seen, later: float, has_age: bool) -> bool:
         """Whether a place that repeats is that of another picture.
@@ -491,7 +495,7 @@ class Samples:
         if not seen.flights:
             return tuple(begin(taken, ball, paddle) for ball in balls)
         # Times of pictures differ from the truth, but not their order.
-        taken = max(taken, seen.flights[0].times[-1] + 1e-3)
+        taken = max(taken, float(seen.flights[0].pictures[-1, 0]) + 1e-3)
         flights = []
         for ball, flight in zip(balls, seen.flights, strict=True):
             following, reason = follow(self._flight, flight, taken, ball, paddle)
@@ -505,10 +509,6 @@ class Samples:
                 raise Doubt("ball_flight", reason)
             flights.append(following)
         return tuple(flights)
-
-    def _believe(self, seen: Seen, measured: Measurements, names: tuple[str, ...]) -> Seen:
-        values = {name: measured[name] for name in names if name in measured}
-        return seen._replace(values=seen.values | values)
 
     def _bridge_values(
         self,
@@ -555,6 +555,11 @@ class Samples:
         if sum(bridge.durations) > window / 3.0 + 1e-9:
             raise doubt.refused()
         return seen._replace(bridges=seen.bridges | {kind: bridge})
+
+
+def _believed(seen: Seen, measured: Measurements, names: tuple[str, ...]) -> Measurements:
+    """The last believed values, with those of some measurements that a sample has."""
+    return seen.values | {name: measured[name] for name in names if name in measured}
 
 
 def _recent(entries: tuple, since: float) -> tuple:

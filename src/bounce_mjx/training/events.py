@@ -37,10 +37,10 @@ class Event:
 
 Callback = Callable[[Event], bool | None]
 """The training waits for it, and ends, as after its last step, once it returns False. An exception
-ends it as a signal does: it is raised once the state is saved, and the callback is called no more;
-one in `start` or `close` is raised at once.
-On several hosts it is called where the run is written. It may have two methods: `start(run,
-config)` is called for each seed before the training, and `close()` after it."""
+stops it, as a signal does: it is raised once the state is saved, and the callback is called no
+more; one in `start` or `close` is raised at once. On several hosts it is called where the run is
+written. It may have two methods: `start(run, config)` is called for each seed before the training,
+and `close()` after it."""
 
 
 def block_points(metrics: dict[str, np.ndarray]) -> list[dict[str, float]]:
