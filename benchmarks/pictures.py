@@ -42,8 +42,8 @@ LOOKED_AT = 0.4
 TOUCHING = 0.041
 """Distance of two balls' centres at which they touch, m."""
 HOPPING = ((0.4, 0.0725), (2.0, 0.1425))
-"""A ball that stayed below a height above the paddle's centre (m) for a time (s) bounces no more: it
-lies 2.25 cm above it, and hops 5 or 12 cm."""
+"""A ball that stayed below a height above the paddle's centre (m) for a time (s) bounces no more:
+it lies 2.25 cm above it, and hops 5 or 12 cm."""
 WORLD = {
     "ball_latency": 0.01,
     "ball_velocity_noise": 0.1,

@@ -23,8 +23,9 @@ GRAVITY = 9.81
 
 # Pictures that count, s.
 _WINDOW = 0.25
-# Noise of a picture in standard deviations, of which 1e6 pictures have no larger one, along an axis
-# and how many times that in a plane; the least standard deviation, m; and that of a picture's time, s.
+# Noise of a picture in standard deviations along an axis, of which 1e6 pictures have no larger one,
+# and how many times that it is in a plane; the least standard deviation, m; and that of a picture's
+# time, s.
 _DEVIATIONS = 5.0
 _IN_PLANE = 1.07
 _LEAST_NOISE = 0.008
