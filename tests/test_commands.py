@@ -16,7 +16,7 @@ from bounce_mjx.commands.main import main as console_script
 from bounce_mjx.commands.play import PlayCommand
 from bounce_mjx.commands.train import fields_of_command
 from bounce_mjx.commands.which_policy import film_command
-from bounce_mjx.config.command_line import flags_of, parse
+from bounce_mjx.config.command_line import all_flags, parse
 from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.folders import choose_checkpoint
@@ -96,6 +96,7 @@ MISTAKES = (
         "train --reward.height.weight three",
         "--reward.height.weight is three, but must be a valid number (",
     ),
+    ("train --randomization.ball-mass 0.5", "ball_mass: 0.5 is not a range; give two numbers"),
     ("train --target-height-range 0.5", "target_height_range: 0.5 is not a range; give two"),
     ("eval pretrained --robot ur5e", "give mirror"),
     ("eval pretrained --log-dir typo", "--log-dir is where the newest run is looked for, and pret"),
@@ -283,7 +284,7 @@ def test_the_help_of_a_training_is_one_screen_and_the_whole_help_has_every_flag(
     assert "--num-envs INT          Environments that run in parallel (default: 512)" in pages[0]
     shown = {*re.findall(r"^  (--[\w.-]+)", pages[1], re.MULTILINE)}
     shown |= {*re.findall(r"^  --.+, (--no-[\w.-]+)", pages[1], re.MULTILINE)}
-    known = {*flags_of(fields_of_command(find_start(None, StartFlags())))}
+    known = {*all_flags(fields_of_command(find_start(None, StartFlags())))}
     assert shown == known
     assert pages[1].index("\nppo:\n") < pages[1].index("--learning-rate FLOAT")
 

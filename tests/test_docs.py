@@ -53,6 +53,7 @@ PAGES = [
     CHECKOUT / "CONTRIBUTING.md",
     *sorted((CHECKOUT / "docs").rglob("*.md")),
 ]
+RECORDS = [CHECKOUT / "CHANGELOG.md", *sorted((CHECKOUT / "benchmarks").glob("*.md"))]
 
 
 def page_id(page: Path) -> str:
@@ -85,7 +86,7 @@ def anchors(page: Path) -> set[str]:
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
-@pytest.mark.parametrize("page", PAGES, ids=page_id)
+@pytest.mark.parametrize("page", PAGES + RECORDS, ids=page_id)
 def test_links_resolve_and_pictures_have_a_description(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
     for description, picture in re.findall(r"!\[([^]]*)\]\(([^)]+)\)", text):
@@ -181,14 +182,14 @@ def test_shown_commands_are_understood(command, monkeypatch: pytest.MonkeyPatch)
 def known_flags() -> set[str]:
     """The flags of every command of the package, and of the maintainers' one."""
     ship = runpy.run_path(str(CHECKOUT / "benchmarks/ship.py"))
-    flags = {"--help", "--help-all", "--import", *cli.flags_of(fields_in(ship["ShipCommand"]))}
-    flags |= set(cli.flags_of(fields_of_command(find_start(None, StartFlags()))))
+    flags = {"--help", "--help-all", "--import", *cli.all_flags(fields_in(ship["ShipCommand"]))}
+    flags |= set(cli.all_flags(fields_of_command(find_start(None, StartFlags()))))
     for info in pkgutil.iter_modules(commands_package.__path__):
         module = importlib.import_module(f"bounce_mjx.commands.{info.name}")
         for name, member in vars(module).items():
             is_command = inspect.isclass(member) and issubclass(member, StrictModel)
             if is_command and name.endswith("Command"):
-                flags |= set(cli.flags_of(fields_in(member)))
+                flags |= set(cli.all_flags(fields_in(member)))
     for example in EXCERPTS.values():
         import_code(CHECKOUT / example)
     for task in (Bounce, find_task("dribble"), find_task("line")):

@@ -377,11 +377,14 @@ def test_the_best_checkpoint_is_told_by_what_chose_it(tmp_path: Path) -> None:
     details = {"episodes": 64.0, "mean_return": 1.0}
 
     def reason(chosen: Result) -> str:
-        seed = SeedRun(tmp_path, TrainConfig(), {})
+        seed = SeedRun(tmp_path, TrainConfig(), {"train": 1.0})
         seed.add_report(Report((clear, chosen), details), None, 64, 0.0)
         seed.progress.best = Report((clear, missed), details)
         print_results([seed], Console(file=(said := io.StringIO())))
-        (line,) = (line for line in said.getvalue().splitlines() if line.startswith("chosen for"))
+        lines = said.getvalue().splitlines()
+        assert lines == [line.rstrip() for line in lines]
+        assert lines[0].startswith("best checkpoint, 64 steps, on fresh")
+        (line,) = (line for line in lines if line.startswith("chosen for"))
         return line
 
     assert reason(close) == "chosen for the largest margin (its tightest: height)"

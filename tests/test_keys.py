@@ -23,7 +23,7 @@ from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.ppo import PPO
 from bounce_mjx.physics import Control
 from bounce_mjx.robot.model import fingerprint
-from bounce_mjx.runs.config import TrainConfig, fields_of
+from bounce_mjx.runs.config import TrainConfig, fields_of_training
 from bounce_mjx.task.registry import find_task
 from bounce_mjx.training.evaluators import Evaluators
 from bounce_mjx.training.job import open_job
@@ -31,7 +31,7 @@ from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.randomization import Term
 from test_ppo import TwoStates
 
-KEYS = fields_of(find_task("bounce").Config)
+KEYS = fields_of_training(find_task("bounce").Config)
 
 # Other values, where neither half of the default nor one more of it is one.
 VALUES = {

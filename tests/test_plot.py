@@ -150,6 +150,54 @@ def test_the_labels_of_groups_differ(tmp_path: Path) -> None:
     assert all("discount" in label and "control_dt" in label for label in labels)
 
 
+def test_a_label_has_words_of_the_user(tmp_path: Path) -> None:
+    """A key as far as it takes to know which weight it is, and a file's name; the code of its
+    content only where another file has that name."""
+    runs = []
+    for name, own, weight in (("a", "", 1.0), ("b", "# mine", 1.0), ("c", "", 2.0)):
+        reward = {"height": {"weight": weight}}
+        config = TrainConfig(env=BounceConfig(reward=reward), algorithm="other")
+        runs.append(write_run(tmp_path / name, config, {"episode/return": {1: 1.0}}))
+        (runs[-1] / "algorithm").mkdir()
+        (runs[-1] / "algorithm/other.py").write_text(own)
+    labels = [group.label for group in group_runs(runs[::2])]
+    assert labels == ["height.weight 1.0 (one run)", "height.weight 2.0 (one run)"]
+    scaled = TrainConfig(env=BounceConfig(reward={"position": {"base_scale": 0.4}}))
+    pair = []
+    for name, config in (("scaled", scaled), ("usual", TrainConfig())):
+        pair.append(write_run(tmp_path / name, config, {"episode/return": {1: 1.0}}))
+    assert group_runs(pair)[0].label == "position.base_scale 0.4 (one run)"
+    labels = [group.label for group in group_runs(runs[:2])]
+    assert all(re.fullmatch(r"algorithm other [0-9a-f]{8} \(one run\)", label) for label in labels)
+    assert len(set(labels)) == 2
+    config = TrainConfig(env=BounceConfig(reward={"height": {"weight": 1.0}}))
+    plain = write_run(tmp_path / "plain", config, {"episode/return": {1: 1.0}})
+    assert [group.label for group in group_runs([plain, runs[0]])] == [
+        "algorithm ppo (one run)",
+        "algorithm other (one run)",
+    ]
+
+
+def test_a_legend_is_grey_where_groups_share_a_label() -> None:
+    """The groups' own labels have their colours."""
+    steps = np.array([1e6, 2e6])
+    curves = {
+        "episode/return": LoggedCurve(steps, np.array([1.0, 2.0])),
+        "results/mean_return": LoggedCurve(steps, np.array([7.0, 9.0])),
+    }
+    groups = [Group(label, [RunCurves(Path("run"), curves, None)]) for label in ("a", "b")]
+    colours = {}
+    for number in (1, 2):
+        (legend,) = curves_figure(groups[:number]).legends
+        texts = [text.get_text() for text in legend.get_texts()]
+        shown = [handle.get_color() for handle in legend.legend_handles]
+        colours[number] = dict(zip(texts, shown, strict=True))
+    points = "evaluation, actions not sampled"
+    assert colours[1][points] == colours[1]["a"]
+    assert colours[2][points] not in (colours[2]["a"], colours[2]["b"])
+    assert colours[2]["a"] == colours[1]["a"] != colours[2]["b"]
+
+
 @pytest.mark.parametrize(
     ("target_kl", "name"), [(0.01, "first learning_rate"), (0.0, "learning_rate")]
 )
@@ -365,6 +413,7 @@ def test_each_result_that_is_not_judged_is_explained() -> None:
         (98.99, ">= 99", False, "98.99"),
         (99.004, ">= 99", True, "99.004"),
         (99.0, ">= 99", True, "99.00"),
+        (1.4997154, "0.1 to 1.5 (targets 0.4 to 0.6 only)", True, "1.4997"),
         (1.5004, "0.1 to 1.5 (targets 0.4 to 0.6 only)", False, "1.5004"),
         (None, ">= 99", False, "-"),
     ],

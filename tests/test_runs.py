@@ -40,7 +40,7 @@ from bounce_mjx.runs.folders import (
 from bounce_mjx.runs.layers import read_preset
 from bounce_mjx.runs.presets import preset_files
 from bounce_mjx.runs.progress import Progress, load_results
-from bounce_mjx.runs.storage import to_json
+from bounce_mjx.runs.storage import seal, to_json
 from bounce_mjx.task import Proportional
 from bounce_mjx.training import run as training_run
 from bounce_mjx.world.config import ActionConfig
@@ -107,12 +107,19 @@ def test_the_newest_run_is_introduced(runs: Path, name: Path | None, capsys) -> 
     ]
 
 
-def test_the_arm_of_the_newest_run_is_named(runs: Path, capsys) -> None:
-    """The runs of all arms lie in the task's folder."""
-    package = "package:some_arms/panda/robot.xml"
-    (runs / "2026-01-02" / "config.yaml").write_text(f"env: {{mjcf: '{package}'}}")
+@pytest.mark.parametrize(
+    ("mjcf", "arm"),
+    [("package:some_arms/panda/robot.xml", "panda/robot.xml"), ("robot/heron.xml", "heron")],
+)
+def test_the_arm_of_the_newest_run_is_named(runs: Path, mjcf: str, arm: str, capsys) -> None:
+    """The runs of all arms lie in the task's folder, and each has its own copy of its arm."""
+    run = runs / "2026-01-02"
+    (run / "robot").mkdir()
+    (run / "robot/heron.xml").touch()
+    seal(run / "robot")
+    (run / "config.yaml").write_text(f"env: {{mjcf: '{mjcf}'}}")
     choose_checkpoint(None, runs)
-    assert "2026-01-02 of the arm in panda/robot.xml (0 of 4" in capsys.readouterr().out
+    assert f"2026-01-02 of the arm {arm} (0 of 4" in capsys.readouterr().out
 
 
 def test_latest_is_a_name_for_every_command(runs: Path, monkeypatch) -> None:

@@ -118,6 +118,12 @@ def test_replay_page_moves_and_makes_no_requests(
     strangers = [url for url in watched.requests if url != own and not url.startswith("blob:null")]
     assert not strangers
     assert not watched.complaints
+    # A browser that cannot draw it says so in place of a white page.
+    sentence = watched.page.get_by_text("needs WebGL")
+    assert sentence.count() == 0
+    watched.page.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
+    watched.page.reload()
+    sentence.wait_for()
 
 
 @pytest.fixture

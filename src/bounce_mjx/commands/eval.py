@@ -84,7 +84,7 @@ def main(args: Sequence[str]) -> None:
     from bounce_mjx.evaluation.limits import describe_limits, limit_shares
     from bounce_mjx.evaluation.policy_evaluation import evaluate_policy
     from bounce_mjx.evaluation.statistics import RECORDED_EPISODES
-    from bounce_mjx.reports.tables import details_line, results_table
+    from bounce_mjx.reports.tables import details_line, print_table, results_table
     from bounce_mjx.runs.checkpoints import read_actor
     from bounce_mjx.runs.storage import check_output, to_json, write_output
     from bounce_mjx.training.setup import set_up_jax
@@ -125,7 +125,7 @@ def main(args: Sequence[str]) -> None:
     measured_in = evaluated.setup.env.config
     if goals.keys() < measured_in.goals.keys() and _stands_still(measured_in, trained.env):
         print(_STILL)
-    console.print(results_table(report, "the results"))
+    print_table(console, results_table(report, "the results"))
     print(details_line(report))
     findings = {}
     for name, measure, describe in checks:
@@ -176,11 +176,12 @@ def _show_failures(
     from bounce_mjx.evaluation.failures import associations
     from bounce_mjx.reports.failures import association_lines, failures_figure, failures_table
     from bounce_mjx.reports.figures import image
+    from bounce_mjx.reports.tables import print_table
     from bounce_mjx.runs.folders import is_users_run
     from bounce_mjx.runs.storage import write_output
 
     terms = associations(statistics, failures)
-    console.print(failures_table(failures, terms, episodes))
+    print_table(console, failures_table(failures, terms, episodes))
     print(*association_lines(terms), sep="\n")
     if terms:
         picture = (run if is_users_run(run) else Path()) / "failures.png"

@@ -45,6 +45,7 @@ class PlayCommand(WhichPolicy):
     policy that comes with the package: pretrained, robust, robust_small, or the name of a task or
     an arm. Several are shown side by side. The default is the newest run, or the task's policy in
     the package if there is no run. mirror stands for the mirror law, a model-based baseline."""
+    viewing: ViewerOptions = ViewerOptions()
     robot: MirrorRobot = None
     world: OtherWorld = None
     randomization: OtherRandomization = RandomizationConfig()
@@ -62,7 +63,6 @@ class PlayCommand(WhichPolicy):
     """Episodes of that evaluation; by default 1,024, of a condition 64."""
     nominal: Annotated[bool, Flag(needs="episode", excludes=("world", "randomization"))] = False
     """Whether that evaluation was without domain randomisation."""
-    viewing: ViewerOptions = ViewerOptions()
 
 
 def main(args: Sequence[str]) -> None:

@@ -255,7 +255,8 @@ def _tell(command: RehearseCommand, session: "Session", arm: "SimulatedArm") -> 
             if command.fault is not None and number == 1:
                 after = episode.seconds - command.fault_at
                 end += f", {after:.2f} s after the fault" if after >= 0.0 else ", before the fault"
-        print(f"episode {number}: {episode.seconds:.2f} s, {bounces} bounces, {end}")
+        start = f"episode {number}, from {episode.start:.2f} s"
+        print(f"{start}: {episode.seconds:.2f} s, {bounces} bounces, {end}")
     if not session.episodes:
         print(f"no episode began: {session.reason}")
     if command.log is not None:

@@ -56,6 +56,7 @@ def main(args: Sequence[str]) -> None:
     from bounce_mjx.evaluation.suite import read_suite
     from bounce_mjx.reports import robustness
     from bounce_mjx.reports.figures import image
+    from bounce_mjx.reports.tables import print_table
     from bounce_mjx.runs.checkpoints import read_actor
     from bounce_mjx.runs.folders import is_users_run
     from bounce_mjx.runs.storage import to_json, writable, write_output
@@ -93,7 +94,7 @@ def main(args: Sequence[str]) -> None:
         measured=outcomes[0].measured,
         outcomes=outcomes,
     )
-    console.print(robustness.robustness_table(report))
+    print_table(console, robustness.robustness_table(report))
     figure = robustness.robustness_figure(report)
     files = {robustness.ROBUSTNESS_FILE: to_json(report.model_dump())}
     files |= {f"robustness.{suffix}": image(figure, suffix) for suffix in ("png", "svg")}

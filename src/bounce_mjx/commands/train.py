@@ -18,7 +18,7 @@ from bounce_mjx.config.settings import Count, NonNegativeInt, fields_in
 from bounce_mjx.errors import UserError
 from bounce_mjx.interrupt import in_daemon_thread, leave
 from bounce_mjx.runs.config import TrainConfig, imports_of
-from bounce_mjx.runs.layers import Layers, layers_on
+from bounce_mjx.runs.layers import CommandLine, Layers, layers_on
 from bounce_mjx.runs.presets import default_preset, has_accelerator, has_plugin
 from bounce_mjx.runs.start import Choice, ChoiceFlags, Start, find_start
 
@@ -96,8 +96,8 @@ class TrainCommand(NamedTuple):
             must stay the same.
         """
         layers = layers_on(self.start, self.flags, machine)
-        names = flag_names(fields_of_command(self.start))
-        return Settings(layers, layers.config(self.said, names, PROG))
+        command = CommandLine(PROG, flag_names(fields_of_command(self.start)))
+        return Settings(layers, layers.config(self.said, command))
 
 
 def fields_of_command(start: Start) -> dict[str, FieldInfo]:

@@ -7,7 +7,7 @@ from typing import Literal
 from bounce_mjx.config.command_line import flag_names, parse, read_flags, stdout
 from bounce_mjx.config.files import flat
 from bounce_mjx.config.settings import StrictModel, fields_in
-from bounce_mjx.runs.layers import read_layers
+from bounce_mjx.runs.layers import CommandLine, read_layers
 from bounce_mjx.runs.start import Choice
 from bounce_mjx.task.registry import DEFAULT
 from bounce_mjx.viewers.options import ViewerOptions
@@ -39,12 +39,11 @@ def main(args: Sequence[str]) -> None:
     layers = read_layers(choice)
     of_env = {key: field for key, field in layers.fields.items() if key.startswith("env.")}
     fields = fields_in(ViewCommand) | of_env
-    names = flag_names(fields)
     defaults = flat(ViewCommand().model_dump()) | flat(layers.config().model_dump())
     about = ViewCommand.__doc__ or ""
     given = read_flags(fields, args, prog=PROG, description=about, defaults=defaults)
     said = {key: value for key, value in given.items() if key in of_env}
-    env = layers.config(said, names, PROG).env
+    env = layers.config(said, CommandLine(PROG, flag_names(fields))).env
     from bounce_mjx.baselines.mirror import MirrorLaw, observing
     from bounce_mjx.training.setup import set_up_jax
     from bounce_mjx.viewers import simulation

@@ -224,7 +224,7 @@ def _near_flag(word: str, fields: Mapping[str, FieldInfo]) -> str:
             if mark.is_positional:
                 return f"its value has no flag, and stands first: {mark.metavar}"
             return f"did you mean {flag_names(fields)[key]}?"
-    return suggest(word, flags_of(fields))
+    return suggest(word, all_flags(fields))
 
 
 def _pairs(words: list[str | None], flag: str, parser: "_Parser") -> dict[str | None, str | None]:
@@ -363,8 +363,8 @@ def _form(kind: Any) -> str:
     return f"{{{','.join(choices)}}}" if choices else " ".join(names)
 
 
-def flags_of(fields: Mapping[str, FieldInfo]) -> list[str]:
-    """The flags of settings."""
+def all_flags(fields: Mapping[str, FieldInfo]) -> list[str]:
+    """Every flag of settings, also those that negate one."""
     flags = []
     for key, flag in flag_names(fields).items():
         if not _mark(fields[key]).is_positional:

@@ -55,11 +55,15 @@ HOLLOW = 2.0 / 3.0
 """That of a thin shell, as a table-tennis ball is."""
 
 
+def as_given(ends: Any) -> str:
+    """What a user gave for a range, as it was written; a flag's one word is in a list."""
+    is_one_word = isinstance(ends, list) and len(ends) == 1 and isinstance(ends[0], str)
+    return shorten(ends[0] if is_one_word else str(ends))
+
+
 def _check_pair(ends: Any) -> Any:
     if not isinstance(ends, list | tuple) or len(ends) != 2:
-        is_one_word = isinstance(ends, list) and len(ends) == 1 and isinstance(ends[0], str)
-        words = ends[0] if is_one_word else str(ends)
-        raise ValueError(f"{shorten(words)} is not a range; give two numbers")
+        raise ValueError(f"{as_given(ends)} is not a range; give two numbers")
     return ends
 
 

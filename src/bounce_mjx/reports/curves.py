@@ -62,6 +62,14 @@ class Group(NamedTuple):
     """What the runs' task logs."""
 
 
+class _File(NamedTuple):
+    """A setting that is a file."""
+
+    name: str
+    code: str
+    """Of its content."""
+
+
 def read_curves(run: Path) -> RunCurves:
     """Reads the finite scalars in the log of a run.
 
@@ -105,6 +113,7 @@ def group_runs(runs: Sequence[Path]) -> list[Group]:
     """
     configs = [load_run_config(run) for run in runs]
     settings = [_settings(run, config) for run, config in zip(runs, configs, strict=True)]
+    _name_files(settings)
     shown = _telling_first(settings)
     members_of: dict[str, list[int]] = {}
     for i, of_run in enumerate(settings):
@@ -115,7 +124,7 @@ def group_runs(runs: Sequence[Path]) -> list[Group]:
         first = members[0]
         config = configs[first]
         group = Group(
-            label=_label(config, _chosen(settings[first], shown), len(members)),
+            label=_label(config, settings[first], shown, len(members)),
             runs=[read_curves(runs[i]) for i in members],
             task_curves=config.env.task.curves,
         )
@@ -135,7 +144,7 @@ def _settings(run: Path, config: TrainConfig) -> dict[str, Any]:
     if settings["env.mjcf"] is not None:
         contents["env.mjcf"] = (run / ROBOT / MANIFEST_FILE).read_bytes()
     for key, content in contents.items():
-        settings[key] = f"{Path(settings[key]).name} {zlib.crc32(content):08x}"
+        settings[key] = _File(Path(settings[key]).name, f"{zlib.crc32(content):08x}")
     if config.algorithm != PPO_NAME:
         settings |= _own_settings(run, settings)
     return settings
@@ -147,9 +156,23 @@ def _own_settings(run: Path, settings: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in stored.items() if name not in settings}
 
 
-def _chosen(settings: dict[str, Any], names: Sequence[str]) -> dict[str, Any]:
-    """The settings of these names that there are."""
-    return {name: settings[name] for name in names if name in settings}
+def _name_files(settings: Sequence[dict[str, Any]]) -> None:
+    """Puts its name in place of each file, with the code of its content only where the name alone
+    would not tell the runs apart.
+
+    Args:
+      settings: of each run, which are changed.
+    """
+    names_of: dict[str, list[str]] = {}
+    for key in (key for of_run in settings for key in of_run if isinstance(of_run[key], _File)):
+        values = {of_run.get(key) for of_run in settings}
+        names_of[key] = [value.name if isinstance(value, _File) else value for value in values]
+    for of_run in settings:
+        for key, names in names_of.items():
+            file = of_run.get(key)
+            if isinstance(file, _File):
+                is_told = names.count(file.name) == 1
+                of_run[key] = file.name if is_told else f"{file.name} {file.code}"
 
 
 def _telling_first(settings: Sequence[dict[str, Any]]) -> list[str]:
@@ -187,12 +210,29 @@ def mean_and_band(curves: Sequence[LoggedCurve]) -> tuple[np.ndarray, np.ndarray
     return steps, values.mean(axis=0), values.std(axis=0)
 
 
-def _label(config: TrainConfig, differences: dict[str, Any], count: int) -> str:
-    """The label of a group of a number of runs of a config."""
-    names = {key: key.rpartition(".")[2] for key in differences}
+def _label(config: TrainConfig, settings: dict[str, Any], shown: Sequence[str], count: int) -> str:
+    """The label of a group of a number of runs of a config.
+
+    Args:
+      settings: of the group, by dotted name.
+      shown: names of the settings that tell the groups apart; the group may lack some.
+    """
+    names = {key: _short_name(key, settings) for key in shown if key in settings}
     if config.adapts_learning_rate and _LEARNING_RATE in names:
         names[_LEARNING_RATE] = "first learning_rate"
-    named = [f"{names[key]} {value}" for key, value in differences.items()]
+    named = [f"{name} {settings[key]}" for key, name in names.items()]
     values = ", ".join(named[:_MAX_NAMED]) + (" …" if len(named) > _MAX_NAMED else "")
     members = "one run" if count == 1 else f"{count} runs"
     return f"{values} ({members})" if values else members
+
+
+def _short_name(key: str, settings: dict[str, Any]) -> str:
+    """The fewest last words of a setting's dotted name that no other setting ends with, such as
+    num_envs; two of one in a group's group, such as that of a reward term: height.weight."""
+    words = key.split(".")
+    fewest = 2 if len(words) > 3 else 1
+    for count in range(fewest, len(words)):
+        name = ".".join(words[-count:])
+        if sum(other == name or other.endswith(f".{name}") for other in settings) == 1:
+            return name
+    return key

@@ -14,6 +14,7 @@ import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
@@ -193,9 +194,13 @@ def image(figure: Figure, suffix: str) -> bytes:
 
 
 def make_panels(count: int, columns: int, height: float) -> tuple[Figure, list[Axes]]:
-    """A figure with a number of panels in rows of a height in inches."""
-    columns = max(1, min(columns, count))
+    """A figure with a number of panels in rows of a height in inches.
+
+    Args:
+      columns: most panels side by side; no more than the rows need.
+    """
     rows = max(1, -(-count // columns))
+    columns = max(1, -(-count // rows))
     size = PANEL_WIDTH * columns, height * rows + 0.6
     figure = Figure(figsize=size, layout="constrained")
     grid = figure.subplots(rows, columns, squeeze=False)
@@ -274,14 +279,27 @@ def _begin_at_zero(axes: Axes) -> None:
 
 def add_legend(figure: Figure) -> None:
     """A legend of what any panel shows."""
-    handles: dict[str, Artist] = {}
+    shown: dict[str, list[Artist]] = {}
     for axes in figure.axes:
-        lines, labels = axes.get_legend_handles_labels()
-        handles |= zip(labels, lines, strict=True)
+        for artist, label in zip(*axes.get_legend_handles_labels(), strict=True):
+            shown.setdefault(label, []).append(artist)
+    handles = {label: _legend_handle(artists) for label, artists in shown.items()}
     # About 0.1 inches a letter with its share of the line and of the gaps.
     widest = max(0.1 * len(label) + 0.6 for label in handles or [""])
     columns = max(1, min(int(figure.get_figwidth() / widest), len(handles)))
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=columns)
+
+
+def _legend_handle(artists: Sequence[Artist]) -> Artist:
+    """What stands in a legend for all that have its label: grey where their colours differ."""
+    first = artists[0]
+    colours = {artist.get_color() for artist in artists if isinstance(artist, Line2D)}
+    if len(colours) < 2:
+        return first
+    grey = Line2D([], [])
+    grey.update_from(first)
+    grey.set_color(_GREY)
+    return grey
 
 
 def _draw_heights(axes: Axes, env: Env, recording: Recording) -> None:

@@ -3,6 +3,7 @@
 import re
 
 import numpy as np
+from rich.console import Console
 from rich.markup import escape
 from rich.table import Column, Table
 
@@ -17,15 +18,23 @@ def figure_text(value: float | None, spec: str = ".2f") -> str:
     return "-" if value is None else f"{value:{spec}}"
 
 
-def result_text(result: Result, spec: str = ".2f") -> str:
-    """A result's value as text, with more digits where it would read as its bound: 98.997 is no
-    99.00 that misses 99."""
-    text = figure_text(result.value, spec)
-    if result.value is None:
-        return text
+def result_text(result: Result, digits: int = 2, form: str = "f") -> str:
+    """A result's value as text, with as many more digits as it takes not to read as its bound:
+    98.997 is no 99.00 that misses 99.
+
+    Args:
+      digits: precision otherwise.
+      form: format of a number, f or g.
+    """
+    value = result.value
+    if value is None:
+        return figure_text(value)
     limits = [float(number) for number in re.findall(r"\d+(?:\.\d+)?", result.bound)]
-    reads_as_limit = float(text) in limits and float(text) != result.value
-    return f"{result.value:.8g}" if reads_as_limit else text
+    text = f"{value:.{digits}{form}}"
+    while float(text) in limits and float(text) != value:
+        digits += 1
+        text = f"{value:.{digits}{form}}"
+    return text
 
 
 def count_text(count: float) -> str:
@@ -40,6 +49,17 @@ def plain_table(title: str, *columns: Column | str) -> Table:
     left = dict(title_justify="left", caption_justify="left")
     look = dict(box=None, pad_edge=False, padding=(0, 1, 0, 0))
     return Table(*columns, title=escape(title), **left, **look)
+
+
+def print_table(console: Console, table: Table) -> None:
+    """Prints a table; elsewhere than on a terminal, without blanks at the ends of its lines."""
+    if console.is_terminal:
+        console.print(table)
+        return
+    with console.capture() as captured:
+        console.print(table)
+    for line in captured.get().splitlines():
+        console.out(line.rstrip(), highlight=False)
 
 
 def results_table(report: Report, title: str) -> Table:
@@ -71,7 +91,7 @@ def seeds_table(reports: dict[int, Report | None]) -> Table:
     for header in ("seed", *(result.name for result in known[0].results), "all met"):
         text = escape(header.replace(" ", "\n"))
         columns.append(Column(text, justify="right"))
-    table = plain_table("best checkpoint of each seed", *columns)
+    table = plain_table("best checkpoint of each seed, on fresh resets", *columns)
     for seed, report in reports.items():
         if report is None:
             table.add_row(str(seed), "diverged")
@@ -130,4 +150,4 @@ def details_line(report: Report) -> str:
         if name != "episodes":
             rounded = None if value is None else float(f"{value:.4g}")
             parts.append(f"{title} {figure_text(rounded, 'g')} {unit}".rstrip())
-    return f"{report.details['episodes']:.0f} episodes: {', '.join(parts)}"
+    return f"{report.details['episodes']:,.0f} episodes: {', '.join(parts)}"

@@ -119,7 +119,7 @@ class TrainConfig(StrictModel):
     def sources(self) -> dict[str, str]:
         """What set each value, by its dotted key, such as configs/cpu.yaml for ppo.num_envs; a
         setting that nothing set has its default."""
-        sources = dict.fromkeys(fields_of(type(self.env), type(self.ppo)), DEFAULT_SOURCE)
+        sources = dict.fromkeys(fields_of_training(type(self.env), type(self.ppo)), DEFAULT_SOURCE)
         for key, source in self._sources.items():
             # Of a mapping, such as `shares`, each entry has a source.
             while key and key not in sources:
@@ -206,7 +206,7 @@ def _check_task(env: WorldConfig, name: str) -> None:
     )
 
 
-def fields_of(
+def fields_of_training(
     task_config: type[WorldConfig], algorithm_config: type[PPOConfig] = PPOConfig
 ) -> dict[str, FieldInfo]:
     """The settings of a training by their dotted keys, such as env.reward.height.weight.

@@ -53,7 +53,7 @@ from bounce_mjx.resources import (
     policy_path,
     resource_path,
 )
-from bounce_mjx.runs.config import CONFIG_FILE, load_run_config, runs_folder
+from bounce_mjx.runs.config import CONFIG_FILE, ROBOT, load_run_config, runs_folder
 from bounce_mjx.runs.progress import load_results
 from bounce_mjx.runs.records import Checkpoint, DamagedCheckpoint, Record, verify
 from bounce_mjx.task.registry import DEFAULT, find_task
@@ -294,7 +294,11 @@ def _arm_of(run: Path) -> str:
         mjcf = load_run_config(run).env.mjcf
     except UserError:
         return ""
-    return "" if mjcf is None else f" of the arm in {mjcf.parent.name}/{mjcf.name}"
+    if mjcf is None:
+        return ""
+    # The run's own copy is in a folder of one name for all arms.
+    is_copy = mjcf.parent.name == ROBOT
+    return f" of the arm {mjcf.stem if is_copy else f'{mjcf.parent.name}/{mjcf.name}'}"
 
 
 def _policy_of_folder(log_dir: Path) -> str | None:

@@ -4,11 +4,13 @@ One word fixes the classes (`start.py`): which task, which algorithm and which p
 training begins with. Everything else is values. They are layers, in the order of `Rank`, and a
 later one wins.
 
-A resumed run has two: its own config, and what the user says; more steps end its
-`stop_when_solved` where that had ended it (`Layers._beyond_solved`). A whole config, of Python, has
-no presets below it. `layers_on` reads the layers below the user's, each file once. `Layers.config`
-merges all of them and validates the result, once; the config then knows what set each of its values
-(`TrainConfig.sources`).
+`layers_on` reads the layers below the user's, each file once. `Layers.config` puts the user's on
+top, merges all of them and validates the result, once; the config then knows what set each of its
+values (`TrainConfig.sources`).
+
+A resumed run has two layers: its own config, and what the user says; more steps switch its
+`stop_when_solved` off where that had ended it (`Layers._beyond_results`). A whole config, of
+Python, has no presets below it.
 """
 
 import dataclasses
@@ -90,10 +92,10 @@ def layers_on(start: Start, files: FileFlags, machine: Path | None = None) -> "L
     Raises:
       UserError: a file is missing, wrong, or of another start.
     """
-    if start.resumed is not None:
+    if start.resumed_config is not None:
         given = {"config": files.config, "robot": files.robot, "world": files.world}
         check_not_given(start.place, given)
-        return Layers(start, (Layer(f"the run {start.place}", start.resumed.model_dump()),))
+        return Layers(start, (Layer(f"the run {start.place}", start.resumed_config.model_dump()),))
     if start.whole is None:
         read = _layers_of_config(start, files.config, machine)
     else:
@@ -183,11 +185,6 @@ def _layers_of_files(files: Iterable[ConfigFile]) -> list[Layer]:
     return layers
 
 
-def _title_of(layers: Sequence[Layer]) -> str:
-    """The sources of the layers in words, the last first."""
-    return " on ".join(layer.source for layer in reversed(layers))
-
-
 def _changed_defaults(algorithm_config: type[PPOConfig]) -> list[Layer]:
     """The defaults of an algorithm of the user's that differ from PPO's (`Rank.ALGORITHM`): it
     means these values, and the machine's preset below them was made for PPO."""
@@ -232,6 +229,15 @@ def _with_networks(of_env: Layer, start: Start) -> Layer:
 # Merging and validating -------------------------------------------------------------------------
 
 
+class CommandLine(NamedTuple):
+    """A command's own words for the settings, which its errors use."""
+
+    prog: str
+    """Such as bounce-mjx train."""
+    flags: Mapping[str, str]
+    """The flag of each setting, by dotted key."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Layers:
     """The layers below what the user says, the lowest first."""
@@ -250,30 +256,26 @@ class Layers:
     @property
     def title(self) -> str:
         """The sources of the layers in words, the last first."""
-        return _title_of(self.below)
+        return " on ".join(layer.source for layer in reversed(self.below))
 
     def config(
-        self,
-        said: Mapping[str, Any] | None = None,
-        flags: Mapping[str, str] | None = None,
-        prog: str = "",
+        self, said: Mapping[str, Any] | None = None, command: CommandLine | None = None
     ) -> TrainConfig:
         """The typed config, with what the user says on top.
 
         Args:
           said: values by their keys. A key may be dotted, and one of `env` or `ppo` stand alone:
             num_envs for ppo.num_envs.
-          flags: the flags of a command line by dotted key, for errors; None in Python.
-          prog: the command, for errors.
+          command: where the user says it; None in Python.
 
         Raises:
           UserError: a key is unknown, a value is out of range, or it must be that of the resumed
             run. The error names the layer that set it.
         """
-        user_source = PYTHON if flags is None else FLAGS
+        user_source = PYTHON if command is None else FLAGS
         # The policy of a warm start is the checkpoint that was found, not the word for it.
         user = self._layer_of_user(user_source, {**(said or {}), **self.start.said})
-        above = [*self._beyond_solved(user), user]
+        above = [*self._beyond_results(user), user]
         layers = [*self.below, *above]
         for layer in layers:
             self._check_groups(layer)
@@ -284,18 +286,18 @@ class Layers:
             config = self._validated(values)
         except _Mistake as mistake:
             setter = _setter_of(mistake.path, layers)
-            if flags is not None and setter == FLAGS:
-                text = describe(mistake.error, self.fields, flags, mistake.group)
-                raise UserError(f"{text} (see {prog} --help)") from mistake.error
+            if command is not None and setter == FLAGS:
+                text = describe(mistake.error, self.fields, command.flags, mistake.group)
+                raise UserError(f"{text} (see {command.prog} --help)") from mistake.error
             text = describe(mistake.error, self.fields, group=mistake.group)
             if setter != PYTHON and mistake.path in (["robot"], ["world"]):
                 (name,) = mistake.path
                 text = f"{name} is no setting; leave it out, and give --{name} or train({name}=...)"
             raise UserError(f"{shorten(setter)}: {text}") from mistake.error
-        if self.start.resumed is not None:
-            _check_resumable(self.start.resumed, config)
+        if self.start.resumed_config is not None:
+            _check_resumable(self.start.resumed_config, config)
             _, changed = _merge(above)
-            sources = self.start.resumed.sources | changed
+            sources = self.start.resumed_config.sources | changed
         config.set_sources(sources)
         return config
 
@@ -338,10 +340,10 @@ class Layers:
                 return full
         return key
 
-    def _beyond_solved(self, user: Layer) -> list[Layer]:
-        """A layer for a run that has met all results, where a number of steps is asked for: it goes
-        on to that number."""
-        if self.start.resumed is None or "total_steps" not in user.values:
+    def _beyond_results(self, user: Layer) -> list[Layer]:
+        """A layer for a resumed run that its results have ended (`waits_are_over`), where a number
+        of steps is asked for: it goes on to that number."""
+        if self.start.resumed_config is None or "total_steps" not in user.values:
             return []
         from bounce_mjx.runs.folders import latest_checkpoint, run_of
         from bounce_mjx.runs.progress import Progress, waits_are_over

@@ -17,7 +17,7 @@ from bounce_mjx.resources import POLICIES, policy_folder
 from bounce_mjx.runs.config import (
     TrainConfig,
     copied_code,
-    fields_of,
+    fields_of_training,
     is_as_copied,
     load_run_config,
     runs_folder,
@@ -91,7 +91,7 @@ class Start(NamedTuple):
     """A whole config, of Python, whose task and algorithm these are; no preset lies below it."""
     place: Path | None = None
     """Folder of the run that is resumed, or a checkpoint in it."""
-    resumed: TrainConfig | None = None
+    resumed_config: TrainConfig | None = None
     """Config of that run."""
     notes: tuple[str, ...] = ()
     """Which run latest stands for."""
@@ -99,7 +99,7 @@ class Start(NamedTuple):
     @property
     def fields(self) -> dict[str, FieldInfo]:
         """The settings that a training from here has, by dotted key."""
-        return fields_of(self.task.Config, self.algorithm_config)
+        return fields_of_training(self.task.Config, self.algorithm_config)
 
 
 def find_start(word: str | None, flags: StartFlags, whole: TrainConfig | None = None) -> Start:
@@ -254,7 +254,7 @@ def _start_of_run(word: Path, flags: StartFlags, whole: TrainConfig | None) -> S
         algorithm_name=config.algorithm,
         said={},
         place=place,
-        resumed=config,
+        resumed_config=config,
     )
 
 

@@ -3,6 +3,9 @@
 
 They are layers (`Layer`), the lowest first: what the policy was trained in, its robot, and
 its world (`layers_of_environment`). A training has further layers between them (`runs/layers.py`).
+
+A world (`World`) is a part of these settings (`WorldConfig`): the randomisation, and what else a
+named world's file sets, such as the delays of a controller.
 """
 
 import os

@@ -37,10 +37,10 @@ class Event:
 
 Callback = Callable[[Event], bool | None]
 """The training waits for it, and ends, as after its last step, once it returns False. An exception
-ends it as a signal does: it is raised once the state is saved, and the callback is called no more;
-one in `start` or `close` is raised at once.
-On several hosts it is called where the run is written. It may have two methods: `start(run,
-config)` is called for each seed before the training, and `close()` after it."""
+stops it, as a signal does: it is raised once the state is saved, and the callback is called no
+more; one in `start` or `close` is raised at once. On several hosts it is called where the run is
+written. It may have two methods: `start(run, config)` is called for each seed before the training,
+and `close()` after it."""
 
 
 def block_points(metrics: dict[str, np.ndarray]) -> list[dict[str, float]]:
@@ -133,7 +133,7 @@ def evaluation_line(config: TrainConfig, steps: int, reports: Sequence[Report]) 
     missing = f", {sure} with a margin"
     if config.num_seeds == 1:
         (report,) = reports
-        figures = (f"{r.name} {result_text(r, '.4g')}" for r in report.results)
+        figures = (f"{r.name} {result_text(r, 4, 'g')}" for r in report.results)
         line = f"{report.summary} ({', '.join(figures)})"
         missing = ", not yet with a margin"
     kind = "evaluation"

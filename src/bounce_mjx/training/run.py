@@ -26,7 +26,13 @@ from bounce_mjx.evaluation.config import EvaluationOptions
 from bounce_mjx.evaluation.policy_evaluation import evaluate_policy
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.interrupt import StopRequest, in_daemon_thread
-from bounce_mjx.reports.tables import details_line, results_table, seeds_table, unsolved_line
+from bounce_mjx.reports.tables import (
+    details_line,
+    print_table,
+    results_table,
+    seeds_table,
+    unsolved_line,
+)
 from bounce_mjx.resources import POLICIES, policy_path
 from bounce_mjx.runs import folders
 from bounce_mjx.runs.checkpoints import read_actor, read_record
@@ -304,11 +310,12 @@ def print_results(seeds: Sequence[job.SeedRun], console: Console) -> job.SeedRun
     best = max(evaluated, key=lambda seed: seed.progress.best.score)
     report = best.progress.best
     if len(seeds) > 1:
-        console.print(seeds_table(reports))
+        print_table(console, seeds_table(reports))
     else:
-        console.print(results_table(report, f"best checkpoint, {best.progress.best_steps:,} steps"))
+        title = f"best checkpoint, {best.progress.best_steps:,} steps, on fresh resets"
+        print_table(console, results_table(report, title))
         say(console, details_line(report))
-        # The printed results are of fresh resets; those that chose the checkpoint are of others.
+        # The figures that chose it are of other resets.
         say(console, f"chosen for {best.best.report.merit}")
     if unsolved := unsolved_line(report, len(seeds)):
         say(console, unsolved)

@@ -47,10 +47,9 @@ class Saver:
     """Writes checkpoints and results in the background, one save after another.
 
     A save that fails is lost, with a best policy in it, as the next one has newer data; of several
-    seeds, those that were written before it failed keep theirs. The first that fails is said
-    at the next evaluation or save, and so is the first that succeeds again; a failure of the last
-    one is the caller's to tell. On several hosts
-    the leader alone writes, and all know what was written.
+    seeds, those that were written before it failed keep theirs. The first that fails is said at the
+    next evaluation or save, and so is the first that succeeds again; a failure of the last one is
+    the caller's to tell. On several hosts the leader alone writes, and all know what was written.
     """
 
     def __init__(

@@ -82,7 +82,7 @@ class TrainingPage:
             if event is None:
                 self._progress.content = _text("<b>Training has ended</b>")
             elif event.report is not None:
-                line = html.escape(evaluation_line(1, event.steps, [event.report]))
+                line = html.escape(evaluation_line(event.config, event.steps, [event.report]))
                 self._results.content = _text(line)
                 simulation.policy = event.policy
             else:

@@ -16,6 +16,19 @@ SUFFIXES = (".html",)
 _DEFAULT_FPS = 30
 _EPISODE_SECONDS = 10.0
 _VISER_TITLE = "<title>Viser</title>"
+# What the page says where a browser cannot draw it, and would leave it white.
+_HEAD = """<title>bounce_mjx</title>
+<script>
+addEventListener("DOMContentLoaded", () => {
+  if (document.createElement("canvas").getContext("webgl2")) return;
+  const said = document.createElement("p");
+  said.style = "position: fixed; inset: 0; z-index: 9999; margin: 0; padding: 1rem;"
+    + " background: #fff; font: 15px/1.5 system-ui, sans-serif";
+  said.textContent = "The replay needs WebGL, which this browser does not have. A video in its"
+    + " place: bounce-mjx play RUN --video replay.mp4";
+  document.body.append(said);
+});
+</script>"""
 
 
 def replay_first_and_worst(env: Env, recording: Recording) -> str:
@@ -71,4 +84,4 @@ def replay(
         if frames.lost[-1].any():
             # The page begins again, which would hide it at once.
             recorder.insert_sleep(ANNOUNCED_SECONDS)
-        return recorder.as_html().replace(_VISER_TITLE, "<title>bounce_mjx</title>", 1)
+        return recorder.as_html().replace(_VISER_TITLE, _HEAD, 1)

@@ -21,7 +21,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 import pydantic
 from pydantic import Field
 
-from bounce_mjx.config.settings import Finite, StrictModel, UnitInterval, whole_number
+from bounce_mjx.config.settings import Finite, StrictModel, UnitInterval, as_given, whole_number
 from bounce_mjx.config.validation import unit_of
 from bounce_mjx.errors import shorten
 from bounce_mjx.lazy import jax, jnp, np
@@ -382,7 +382,7 @@ def _is_no_range(name: str, ends: Any) -> str:
     else:
         (num_axes,) = size
         lists = f", or two lists with one for each of {num_axes} axes"
-    return f"{shorten(str(ends))} is not a range; give two numbers{lists}"
+    return f"{as_given(ends)} is not a range; give two numbers{lists}"
 
 
 def entries(ends: Range) -> list[tuple[float, float]]:
