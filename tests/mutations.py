@@ -156,7 +156,7 @@ FAULTS = [
      "isinstance(answer, bool | np.bool_) and not answer", "False", "test_job.py -k callback_sees"),
     ("a signal does not stop the training", "training/job.py", "return hosts.any_of(self.stop.requested or self.failure is not None)", "return hosts.any_of(False)", "test_job.py -k signal_saves"),
     ("a signal during the last save is lost", "training/job.py",
-     "        must_stop = self.must_stop()\n", "        must_stop = is_early\n", "test_job.py -k last_save"),
+     "        must_stop = self.must_stop()\n", "        must_stop = was_stopped\n", "test_job.py -k last_save"),
     ("the state of several seeds is a policy", "runs/folders.py", "if seeds == [run]:", "if True:", "test_job.py -k no_policy_and_no_damage"),
     ("a checkpoint has the results of the best one", "training/run.py",
      "if checkpoint != folders.best_checkpoint(checkpoint.run):", "if False:", "test_job.py -k history_of_checkpoints"),

@@ -1,8 +1,9 @@
 """The settings of a training, from wherever they come.
 
-One word fixes the classes (`start.py`): which task, which algorithm and which policy or run a
-training begins with. Everything else is values. They are layers, in the order of `Rank`, and a
-later one wins.
+The first word, --algorithm and --warm-start fix the classes (`start.py`): which task, which
+algorithm and which policy or run a training begins with. Everything else is values. They are layers
+(`Layer`), in the order of `Rank`, and a later one wins. Those of the environment alone, of a
+policy, a robot and a world, are in `worlds.py`.
 
 `layers_on` reads the layers below the user's, each file once. `Layers.config` puts the user's on
 top, merges all of them and validates the result, once; the config then knows what set each of its
@@ -64,8 +65,10 @@ class Rank(enum.StrEnum):
 
 FLAGS = "flags"
 """Source of the settings on a command line."""
-PYTHON = "train"
-"""Source of the arguments of `train`."""
+PYTHON = "train()"
+"""Source of the arguments of `train` in Python."""
+BEYOND_RESULTS = "more steps, after the results had ended the run"
+"""Source of a `stop_when_solved` that is switched off (`Layers._beyond_results`)."""
 
 
 # Reading: what lies on what ---------------------------------------------------------------------
@@ -153,9 +156,9 @@ def _layers_of_whole(whole: TrainConfig, warm_start: Path | None) -> ConfigLayer
 
 
 def _check_start(layer: Layer, start: Start) -> None:
-    """Checks that a file, which has values alone, is of what the training begins with. The word
-    alone says the task. An algorithm or a warm start that the user names wins over the file's, as
-    any flag does.
+    """Checks that a file, which has values alone, is of what the training begins with: no file says
+    the task. An algorithm or a warm start that the user names wins over the file's, as any flag
+    does.
 
     Raises:
       UserError: it is of another task, or of an algorithm or a warm start that the user does not
@@ -168,7 +171,7 @@ def _check_start(layer: Layer, start: Start) -> None:
     }
     for key, (ours, remedy) in begun.items():
         theirs = layer.values.get(key)
-        wins = key != "task" and key in start.said
+        wins = key != "task" and key in start.named
         if theirs is not None and theirs != ours and not wins:
             raise UserError(
                 f"{layer.source} is of the {key} {theirs}, and this training of {ours or 'none'}; "
@@ -266,7 +269,8 @@ class Layers:
         Args:
           said: values by their keys. A key may be dotted, and one of `env` or `ppo` stand alone:
             num_envs for ppo.num_envs.
-          command: where the user says it; None in Python.
+          command: where the user says it, which its errors and the source of its values name; None
+            in Python.
 
         Raises:
           UserError: a key is unknown, a value is out of range, or it must be that of the resumed
@@ -274,7 +278,7 @@ class Layers:
         """
         user_source = PYTHON if command is None else FLAGS
         # The policy of a warm start is the checkpoint that was found, not the word for it.
-        user = self._layer_of_user(user_source, {**(said or {}), **self.start.said})
+        user = self._layer_of_user(user_source, {**(said or {}), **self.start.named})
         above = [*self._beyond_results(user), user]
         layers = [*self.below, *above]
         for layer in layers:
@@ -353,7 +357,7 @@ class Layers:
         progress = verify(checkpoint).progress
         seeds = [Progress.model_validate(seed) for seed in progress.get("seeds", [progress])]
         if waits_are_over(seeds):
-            return [Layer(user.source, {"stop_when_solved": False})]
+            return [Layer(BEYOND_RESULTS, {"stop_when_solved": False})]
         return []
 
     def _validated(self, values: dict[str, Any]) -> TrainConfig:
@@ -396,11 +400,11 @@ def _merge(layers: Sequence[Layer]) -> tuple[dict[str, Any], dict[str, str]]:
         if layer.is_world:
             randomization = without_idle_curriculum(values["env"]["randomization"])
             values["env"] = values["env"] | {"randomization": randomization}
-        for key in flat(layer.values):
-            # As the last key, by which `TrainConfig.sources` tells the source of a mapping, such as
-            # `shares`, whose entries may have several.
-            sources.pop(key, None)
-            sources[key] = layer.source
+        its_keys = flat(layer.values)
+        kept = {key: source for key, source in sources.items() if key not in its_keys}
+        # The newest keys come last: `TrainConfig.sources` gives a mapping such as `shares`, whose
+        # entries may have several sources, the last of these.
+        sources = kept | dict.fromkeys(its_keys, layer.source)
     # A later layer may end a value, or replace a mapping by None.
     remaining = flat(values)
     return values, {key: source for key, source in sources.items() if key in remaining}
