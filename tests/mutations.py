@@ -182,7 +182,7 @@ FAULTS = [
     ("a file wins over a flag", "runs/layers.py",
      "layers = [*self.below, *above]", "layers = [*above, *self.below]", "test_settings.py -k wins_over_those"),
     ("the machine's preset wins over an algorithm's defaults", "runs/layers.py",
-     "Rank.MACHINE: read.machine,\n        Rank.ALGORITHM: changed,", "Rank.MACHINE: changed,\n        Rank.ALGORITHM: read.machine,", "test_settings.py -k algorithms_own_default"),
+     "layers[Rank.ALGORITHM] = _changed_defaults(start.algorithm_config)", "layers[Rank.MACHINE] = _changed_defaults(start.algorithm_config) + layers[Rank.MACHINE]", "test_settings.py -k algorithms_own_default"),
     ("a world loses its own randomisation", "runs/worlds.py",
      'merged({"env": {"randomization": default}}, {"env": _settings_for(task, world)})', 'merged({"env": world.settings}, {"env": {"randomization": default}})', "test_settings.py -k wins_over_those"),
     ("another version's setting is taken for a slip", "runs/config.py", "if key is None:", "if True:", "test_runs.py -k another_version"),

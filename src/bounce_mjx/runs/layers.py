@@ -99,60 +99,32 @@ def layers_on(start: Start, files: FileFlags, machine: Path | None = None) -> "L
         given = {"config": files.config, "robot": files.robot, "world": files.world}
         check_not_given(start.place, given)
         return Layers(start, (Layer(f"the run {start.place}", start.resumed_config.model_dump()),))
+    layers: dict[Rank, list[Layer]] = {rank: [] for rank in Rank}
     if start.whole is None:
-        read = _layers_of_config(start, files.config, machine)
+        read = preset_files(files.config, start.task_name, machine)
+        layers[Rank.MACHINE] = _layers_of_files(read.machine)
+        layers[Rank.PRESET] = _layers_of_files(read.preset)
+        layers[Rank.FILES] = _layers_of_files(read.files)
+        for layer in (*layers[Rank.PRESET], *layers[Rank.FILES]):
+            _check_start(layer, start)
     else:
-        read = _layers_of_whole(start.whole, start.warm_start)
-    changed = _changed_defaults(start.algorithm_config)
+        # Its warm start is the checkpoint that was found for it.
+        whole = start.whole.model_dump() | {"warm_start": start.warm_start}
+        layers[Rank.FILES] = [Layer("config", whole, replaces=("env", "ppo"))]
+    layers[Rank.ALGORITHM] = _changed_defaults(start.algorithm_config)
     trained = None if start.warm_config is None else start.warm_config.env
     of_env = layers_of_environment(start.task, trained, files.robot, files.world)
     for layer in of_env.robot:
         _check_start(layer, start)
-    policies = [_with_networks(layer, start) for layer in of_env.policy]
-    changes = _notes(changed, read.preset, "ppo.") + _notes(read.preset, policies, "env.")
-    layers: dict[Rank, list[Layer]] = {
-        Rank.MACHINE: read.machine,
-        Rank.ALGORITHM: changed,
-        Rank.PRESET: read.preset,
-        Rank.WARM_START: policies,
-        Rank.FILES: read.files,
-        Rank.ROBOT: of_env.robot,
-        Rank.WORLD: of_env.world,
-    }
-    below = [layer for rank in Rank for layer in layers.get(rank, [])]
-    return Layers(start=start, below=tuple(below), notes=(*start.notes, *changes))
-
-
-class ConfigLayers(NamedTuple):
-    """The settings that `--config` stands for, as `PresetFiles`."""
-
-    machine: list[Layer]
-    """One layer or none."""
-    preset: list[Layer]
-    """One layer or none."""
-    files: list[Layer]
-
-
-def _layers_of_config(start: Start, config: Sequence[Path], machine: Path | None) -> ConfigLayers:
-    """The layers of presets and files.
-
-    Raises:
-      UserError: a file is missing, wrong, or of another start.
-    """
-    read = ConfigLayers(*map(_layers_of_files, preset_files(config, start.task_name, machine)))
-    for layer in (*read.preset, *read.files):
-        _check_start(layer, start)
-    return read
-
-
-def _layers_of_whole(whole: TrainConfig, warm_start: Path | None) -> ConfigLayers:
-    """The layer of a whole config of Python, which has no preset below it.
-
-    Args:
-      warm_start: the policy that was found for its own.
-    """
-    values = whole.model_dump() | {"warm_start": warm_start}
-    return ConfigLayers([], [], [Layer("config", values, replaces=("env", "ppo"))])
+    layers[Rank.WARM_START] = [_with_networks(layer, start) for layer in of_env.policy]
+    layers[Rank.ROBOT] = of_env.robot
+    layers[Rank.WORLD] = of_env.world
+    notes = (
+        *start.notes,
+        *_notes(layers[Rank.ALGORITHM], layers[Rank.PRESET], "ppo."),
+        *_notes(layers[Rank.PRESET], layers[Rank.WARM_START], "env."),
+    )
+    return Layers(start, tuple(layer for rank in Rank for layer in layers[rank]), notes)
 
 
 def _check_start(layer: Layer, start: Start) -> None:
