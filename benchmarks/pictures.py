@@ -6,8 +6,9 @@ times that jitter.
 
 Each policy plays as in a rehearsal, in sessions of 20 s, until its episodes have the asked time
 together, or three times as much was simulated: a ball that is lost is fetched, and the arm sent
-home. A stop is true where the ball was lost, and where the simulation had two balls touch, or one
-come to rest on the paddle, in the 0.4 s before; else it is a false alarm. The arm has no other
+home. A stop is true where the ball was lost, where the simulation had two balls touch in the 0.4 s
+before, and where one had stopped to bounce: it hopped less than 5 cm for 0.4 s, or less than 12 cm
+for the 2 s in which a ball has to leave the paddle; else it is a false alarm. The arm has no other
 errors than those given here and a little noise of its encoders. A policy whose arm's package is
 missing is named and left out.
 """
@@ -37,11 +38,12 @@ SESSION = 20.0
 MOST = 3.0
 """Time that is simulated at most, as a share of the time that is to be played."""
 LOOKED_AT = 0.4
-"""Time before a stop in which a ball shows what happened, s."""
+"""Time before a stop in which balls touched, s."""
 TOUCHING = 0.041
 """Distance of two balls' centres at which they touch, m."""
-LYING = 0.05
-"""Height of a ball above the paddle's centre, which one that bounces leaves, m."""
+HOPPING = ((0.4, 0.0725), (2.0, 0.1425))
+"""A ball that stayed below a height above the paddle's centre (m) for a time (s) bounces no more:
+it lies 2.25 cm above it, and hops 5 or 12 cm."""
 WORLD = {
     "ball_latency": 0.01,
     "ball_velocity_noise": 0.1,
@@ -90,18 +92,27 @@ def what_happened(arm: SimulatedArm, episode: Episode) -> str | None:
     if episode.fault == "ball_lost":
         return "ball lost"
     end = episode.start + episode.seconds
-    balls = []
-    heights = []
+    longest = max(seconds for seconds, _ in HOPPING)
+    times = []
+    places = []
     for moved in arm.path:
-        if end - LOOKED_AT < moved.time <= end:
+        if end - longest < moved.time <= end:
             arm.data.qpos = moved.qpos
             mujoco.mj_kinematics(arm.model, arm.data)
-            balls.append([arm.data.xpos[ball.body].copy() for ball in arm.balls])
-            heights.append(np.array(balls[-1])[:, 2] - arm.paddle[2])
-    for first, second in itertools.combinations(np.moveaxis(np.array(balls), 1, 0), 2):
+            times.append(moved.time)
+            places.append([arm.data.xpos[ball.body] - arm.paddle for ball in arm.balls])
+    ages = end - np.array(times)
+    # [T, B, 3], relative to the paddle.
+    balls = np.array(places)
+    late = balls[ages < LOOKED_AT]
+    for first, second in itertools.combinations(np.moveaxis(late, 1, 0), 2):
         if np.linalg.norm(first - second, axis=-1).min() < TOUCHING:
             return "balls touched"
-    return "ball lay" if np.max(heights, axis=0).min() < LYING else None
+    for seconds, height in HOPPING:
+        heights = balls[ages < seconds, :, 2]
+        if episode.seconds > seconds and heights.max(axis=0).min() < height:
+            return "ball no longer bounced"
+    return None
 
 
 def run(case: Case) -> Played:

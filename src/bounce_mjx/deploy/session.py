@@ -214,7 +214,7 @@ def _start(supervisor: Supervisor, measured: Mapping[str, Any]) -> str | None:
     return None
 
 
-def replay(arm: Arm, trajectory: Trajectory, recorder: Recorder | None = None) -> None:
+def replay(arm: Arm, trajectory: Trajectory, recorder: Recorder | None = None) -> np.ndarray:
     """Moves an arm along a trajectory, without a policy and without a ball, such as that of
     `bounce-mjx excite`. Each period has its target, between those of the two times around it.
 
@@ -223,24 +223,31 @@ def replay(arm: Arm, trajectory: Trajectory, recorder: Recorder | None = None) -
       trajectory: of the servo targets.
       recorder: of a log with a row for each period; None for none.
 
+    Returns:
+      The largest distance of each joint [J] from its target at the time, rad.
+
     Raises:
       UserError: the arm is not at the begin of the trajectory, or a joint does not follow it; the
         arm is stopped first.
     """
     names = trajectory.joint_names
     sent: list[np.ndarray] = []
+    away = np.zeros(len(names))
     try:
         _check_start(trajectory, np.array(arm.measure()["joint_angles"]))
         for time in np.arange(0.0, trajectory.times[-1], 1.0 / arm.rate):
             measured = arm.measure()
+            angles = np.array(measured["joint_angles"])
             sent.append(trajectory.at(time))
             recent = np.array(sent[-round(_LATE * arm.rate) :])
-            _check_following(names, np.array(measured["joint_angles"]), recent)
+            _check_following(names, angles, recent)
+            away = np.maximum(away, np.abs(angles - sent[-1]))
             arm.send(sent[-1][None])
             if recorder is not None:
                 recorder.step(measured, sent[-1])
     finally:
         arm.stop()
+    return away
 
 
 def _check_start(trajectory: Trajectory, angles: np.ndarray) -> None:
