@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from bounce_mjx.commands import train as train_command
 from bounce_mjx.config.user_code import import_code
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.results import Report, Result
@@ -28,7 +29,7 @@ from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.ppo import PPO
 from bounce_mjx.runs import checkpoints
 from bounce_mjx.runs.checkpoints import policy_shapes, read_networks, read_policy, read_record
-from bounce_mjx.runs.config import TrainConfig, imports_of, load_run_config
+from bounce_mjx.runs.config import TrainConfig, import_flags_of_run, load_run_config
 from bounce_mjx.runs.folders import (
     Checkpoint,
     best_checkpoint,
@@ -37,12 +38,12 @@ from bounce_mjx.runs.folders import (
     place_or_newest,
     stored_checkpoints,
 )
-from bounce_mjx.runs.layers import read_layers
+from bounce_mjx.runs.layers import BEYOND_RESULTS, read_layers
 from bounce_mjx.runs.start import Choice
 from bounce_mjx.runs.storage import lock_run
 from bounce_mjx.training import hosts, job, saving
 from bounce_mjx.training.events import Event, block_line, evaluation_line
-from bounce_mjx.training.faults import first_block_fault
+from bounce_mjx.training.faults import why_unlearnable
 from bounce_mjx.training.run import Run, print_results
 from bounce_mjx.training.seeds import SeedRun
 from bounce_mjx.training.trainer import Snapshot
@@ -277,11 +278,17 @@ def test_an_algorithm_brings_its_own_trainer(tmp_path: Path, monkeypatch) -> Non
     run = _run_of(config, None, (), io.StringIO(), scores)
     assert (config.ppo.start_steps, config.iterations_per_block) == (8, 2)
     assert results_of(run)["best_steps"] == 128
-    assert imports_of(run) == []
-    assert imports_of(run, to_train=True) == ["--import", str(run / "algorithm/counting.py")]
+    assert import_flags_of_run(run) == []
+    copy = str(run / "algorithm/counting.py")
+    assert import_flags_of_run(run, to_train=True) == ["--import", copy]
     longer = read_layers(Choice(word=str(run))).config({"total_steps": 192})
     _run_of(longer, run, (), io.StringIO(), scores)
     assert evaluated_steps(run) == [64, 128, 192]
+    # What PPO refuses before the training is nothing to another algorithm.
+    long_rollout = said | {"rollout_length": 10_000, "seed": 21}
+    train_command.print_config(read_layers(choice).config(long_rollout))
+    with pytest.raises(UserError, match="rollout"):
+        train_command.print_config(read_layers(Choice()).config(long_rollout))
     (tmp_path / "without.py").write_text(
         "from bounce_mjx.learning.algorithm import Algorithm\nclass Without(Algorithm):\n    pass"
     )
@@ -419,7 +426,8 @@ def test_a_training_stops_once_its_results_have_a_margin(tmp_path: Path) -> None
     layers = read_layers(Choice(word=str(run)))
     going_on = layers.config({"total_steps": 10**6})
     assert not going_on.stop_when_solved
-    assert going_on.sources["stop_when_solved"] == going_on.sources["total_steps"] == "train"
+    assert going_on.sources["total_steps"] == "train()"
+    assert going_on.sources["stop_when_solved"] == BEYOND_RESULTS
     assert layers.config().stop_when_solved
     assert latest_checkpoint(run).steps == 192
     train(tmp_path, RETURNS, run, margins=margins, said=(shown := io.StringIO()))
@@ -449,7 +457,7 @@ def test_settings_that_cannot_be_trained_are_refused_before_a_save(tmp_path: Pat
     # Its scale counts.
     ppo = PPOConfig(num_envs=8, rollout_length=8, num_minibatches=2, reward_scale=0.04)
     metrics = OtherUnit.train_block(OtherUnit(TrainConfig(ppo=ppo), None))
-    assert first_block_fault(metrics, TrainConfig(ppo=ppo)) is None
+    assert why_unlearnable(metrics, TrainConfig(ppo=ppo)) is None
 
 
 def test_a_callback_sees_blocks_and_evaluations_and_ends_the_training(tmp_path: Path) -> None:
@@ -569,7 +577,8 @@ def test_a_signal_during_the_last_save_is_not_lost(tmp_path: Path, monkeypatch) 
         start(self, snapshot, steps, about)
 
     monkeypatch.setattr(saving.Saver, "start", interrupted)
-    with pytest.raises(job.TrainingStopped, match="after 128 steps, after the final evaluation"):
+    ended = "after 128 steps, at the end of the training; the results are in"
+    with pytest.raises(job.TrainingStopped, match=ended):
         train(tmp_path, {1: 5.0, 2: 9.0})
     (run,) = tmp_path.iterdir()
     assert results_of(run)["fresh_resets"]

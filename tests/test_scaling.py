@@ -218,7 +218,7 @@ def test_the_setting_in_which_hosts_differ_is_named(
         pytest.raises(UserError, match=difference) if difference else contextlib.nullcontext()
     )
     with expected:
-        hosts.agree(TrainConfig().model_copy(update=changes), resume)
+        hosts.check_equal_configs(TrainConfig().model_copy(update=changes), resume)
 
 
 def test_what_hosts_exchange_is_deleted_once_all_have_read_it(monkeypatch) -> None:

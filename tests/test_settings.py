@@ -127,7 +127,7 @@ def test_flag_file_and_python_are_alike_for_every_key(group: str, folder: Path) 
         assert all(config == configs[0] for config in configs), key
         if configs[0] is not None:
             sources = [config.sources[key] for config in configs]
-            assert sources == ["flags", "my.yaml", "train", "train"]
+            assert sources == ["flags", "my.yaml", "train()", "train()"]
 
 
 def test_a_source_wins_over_those_before_it(folder: Path) -> None:
@@ -229,14 +229,14 @@ def test_a_whole_config_stands_alone_below_what_python_says() -> None:
     config = python(config=whole, seed=5, num_envs=64)
     ppo = whole.ppo.model_copy(update={"num_envs": 64})
     assert config == whole.model_copy(update={"seed": 5, "ppo": ppo})
-    assert config.sources["seed"] == "train" and config.sources["ppo.num_epochs"] == "config"
+    assert config.sources["seed"] == "train()" and config.sources["ppo.num_epochs"] == "config"
     for arguments, sentence in (
-        ({"nonsense": 5}, "train: unknown key nonsense; known keys here are"),
-        ({"num_env": 5}, "train: unknown key num_env; did you mean ppo.num_envs?"),
+        ({"nonsense": 5}, "train(): unknown key nonsense; known keys here are"),
+        ({"num_env": 5}, "train(): unknown key num_env; did you mean ppo.num_envs?"),
         ({"start": "catch"}, "the config is of the task bounce, and the first argument is catch"),
         ({"task": "catch"}, "task is the first argument: train('catch', ...)"),
         ({"resume": "runs/x"}, "resume is the first argument: train('runs/x', ...)"),
-        ({"num_envs": 0}, "train: ppo.num_envs is 0, but must be greater than or equal to 1"),
+        ({"num_envs": 0}, "train(): ppo.num_envs is 0, but must be greater than or equal to 1"),
         ({"start": whole}, "the first argument is a config; give it by name: train(config=...)"),
         ({"config": {"seed": 1}}, "config is a mapping; give its keys as arguments: train(..., **"),
     ):

@@ -31,7 +31,7 @@ from bounce_mjx.env.vector import VectorStep
 from bounce_mjx.errors import UserError
 from bounce_mjx.learning.metrics import rollout_metrics, step_metrics
 from bounce_mjx.runs import checkpoints
-from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig, imports_of, load_run_config
+from bounce_mjx.runs.config import CONFIG_FILE, TrainConfig, import_flags_of_run, load_run_config
 from bounce_mjx.runs.creation import create_run
 from bounce_mjx.runs.folders import find_checkpoint
 from bounce_mjx.runs.layers import read_preset
@@ -860,7 +860,7 @@ def test_a_command_without_its_import_prints_the_whole_command(
     )
     (run_folder / "checkpoints/1").mkdir(parents=True)
     copy = run_folder / "task" / "mine.py"
-    assert imports_of(run_folder) == ["--import", str(copy)]
+    assert import_flags_of_run(run_folder) == ["--import", str(copy)]
     for line in (f"eval {run_folder}", f"play {run_folder}", f"train {run_folder} --seed 3"):
         user_code._code_files.clear()
         refused(line, f"import it to run it: bounce-mjx {line} --import {copy}")
@@ -1069,7 +1069,7 @@ def test_a_task_may_name_a_goal_or_a_setting_like_a_flag(
     assert given.checked(env) == {"episodes": 0.5, "model_config": 1.0, "size": 0.1}
     flags = "--no-report --env.report 0.25 --seed 8 --env.seed 9".split()
     command = train_command.read_command(["sized", *flags])
-    config = command.settings().config
+    config = command.settings(Path("cpu")).config
     assert (command.flags.report, config.seed) == (False, 8)
     assert (config.env.report, config.env.seed) == (0.25, 9)
 

@@ -14,7 +14,7 @@ from bounce_mjx.config.validation import validate
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.training.faults import first_block_fault
+from bounce_mjx.training.faults import why_unlearnable
 from bounce_mjx.world.config import Goal
 
 WRONG = """
@@ -330,10 +330,10 @@ LATE, NAN = np.array([0.0, 0.0, 3.0, 3.0]), np.array([1.0, 1.0, 1.0, np.nan])
     ],
 )
 def test_a_first_block_without_a_chance_is_refused(block: dict, reason: str | None) -> None:
-    found = first_block_fault(block, FIRST)
+    found = why_unlearnable(block, FIRST)
     assert re.search(reason, found) if reason else found is None
 
 
 def test_a_short_time_limit_is_no_fault() -> None:
     short = FIRST.model_copy(update={"env": config("bounce", episode_seconds=0.05)})
-    assert first_block_fault(first_block(ended=16.0), short) is None
+    assert why_unlearnable(first_block(ended=16.0), short) is None

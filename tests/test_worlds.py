@@ -23,7 +23,7 @@ from bounce_mjx.runs.folders import find_checkpoint
 from bounce_mjx.runs.layers import read_layers, read_preset
 from bounce_mjx.runs.start import Choice
 from bounce_mjx.runs.worlds import (
-    AS_TRAINED,
+    OWN,
     read_named_world,
     robot_in_world,
     settings_in_world,
@@ -240,7 +240,7 @@ def test_a_policy_is_measured_in_the_world_alone() -> None:
 def test_a_warm_start_is_in_the_world_in_which_its_policy_is_measured() -> None:
     """One function says what a policy's environment is in a world, for a training too."""
     trained = load_run_config(find_checkpoint("robust_small").run).env
-    for flag, world in ((None, AS_TRAINED), (Path("fast_servo"), "fast_servo")):
+    for flag, world in ((None, OWN), (Path("fast_servo"), "fast_servo")):
         choice = Choice(word="robust_small", world=flag)
         begun = read_layers(choice, resource_path("configs/cpu.yaml")).config().env
         assert begun == settings_in_world(trained, world)

@@ -17,6 +17,7 @@ import pytest
 
 from bounce_mjx.commands import train as train_command
 from bounce_mjx.runs.folders import Checkpoint
+from bounce_mjx.runs.presets import default_preset, has_accelerator
 from bounce_mjx.runs.storage import MANIFEST_FILE, check_integrity
 
 TRAIN_SCRIPT = Path(__file__).parent.parent / "train_jax.py"
@@ -50,7 +51,8 @@ def quick_compilation() -> Iterator[None]:
 
 def settings_of(words: Sequence[str], machine: Path | None = None) -> train_command.Settings:
     """What a command line of `bounce-mjx train` trains, by default on this machine."""
-    return train_command.read_command(words).settings(machine)
+    preset = machine or default_preset(has_accelerator())
+    return train_command.read_command(words).settings(preset)
 
 
 def shared_run(name: str = "straight", *flags: str) -> Path:

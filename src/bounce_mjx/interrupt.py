@@ -46,10 +46,11 @@ def _handle(number: int, handler: Any) -> Any:
 
 
 class StopRequest:
-    """While entered in the main thread, the first signal only sets `requested`; a later SIGINT or
-    SIGTERM does what it did before. By the default action, which commands have (`end_on_ctrl_c`),
-    it ends the process at once. Python's own handler, also that of a notebook, raises a
-    KeyboardInterrupt; after one that returns, the process ends too."""
+    """While entered in the main thread, the first signal only sets `requested`. A SIGINT or SIGTERM
+    more than `_SAME_REQUEST_SECONDS` later does what it did before: by the default action, which
+    commands have (`end_on_ctrl_c`), it ends the process at once; a Python handler is called, of
+    which Python's own, also that of a notebook, raises a KeyboardInterrupt, and the process ends
+    where one returns. Any other signal after the first does nothing."""
 
     def __init__(self) -> None:
         self._requested_at: float | None = None

@@ -14,7 +14,8 @@ class of these, as said:
 | gymnax, PureJaxRL | `GymnaxTaskEnv`, `PureJaxRLTaskEnv` | `gymnax_env.py` |
 
 `Run.policy_in` acts in any of these with a policy, also below wrappers; it finds the `Env` by
-`core`, and by the names that libraries give to what they wrap (`deploy/wrappers.py`).
+`core`, and by the names that libraries give to what they wrap (`deploy/wrappers.py`). For a policy
+in an .onnx file, `deploy.loading.load_policy(env=...)` checks the same.
 
 What belongs to a library that need not be installed is imported from its own file.
 """

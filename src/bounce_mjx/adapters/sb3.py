@@ -55,6 +55,7 @@ class Sb3VecEnv(VecEnv):
     def _batch(self) -> Batch:
         return self._envs._batch
 
+    # Properties that ask the batch, which both classes have.
     core = TaskEnv.core
     mj_model = TaskEnv.mj_model
     dt = TaskEnv.dt

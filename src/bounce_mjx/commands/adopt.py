@@ -10,7 +10,7 @@ import yaml
 
 from bounce_mjx.config.command_line import Flag, parse
 from bounce_mjx.config.settings import StrictModel
-from bounce_mjx.config.user_code import import_flags
+from bounce_mjx.config.user_code import import_flags_of_classes
 from bounce_mjx.config.validation import validate
 from bounce_mjx.errors import UserError
 from bounce_mjx.resources import ARM_POLICIES, resource_path
@@ -76,7 +76,7 @@ def main(args: Sequence[str]) -> None:
     out = command.out or Path(f"{command.mjcf.stem.rpartition(':')[2]}.yaml")
     write_output(out, _as_yaml(args, settings))
     print(f"config: {out}")
-    flags = ["--robot", str(out), *import_flags(task)]
+    flags = ["--robot", str(out), *import_flags_of_classes(task)]
     viewed = flags
     trained = flags
     if command.task != DEFAULT:
@@ -136,12 +136,12 @@ def known_arm(model: "mujoco.MjModel", config: WorldConfig) -> str | None:
     """The name in configs/robots/ of an arm with the same lengths and axes; None if there is none,
     or the package with its file is not installed."""
     from bounce_mjx.robot.likeness import are_alike
-    from bounce_mjx.runs.worlds import AS_TRAINED, settings_in_world
+    from bounce_mjx.runs.worlds import OWN, settings_in_world
     from bounce_mjx.world.model import world_model
 
     for file in sorted(resource_path(ROBOTS).glob("*.yaml")):
         try:
-            known = settings_in_world(config.task, AS_TRAINED, file)
+            known = settings_in_world(config.task, OWN, file)
             if known.num_joints == config.num_joints and are_alike(
                 world_model(known, visual=False), model
             ):

@@ -19,7 +19,7 @@ from bounce_mjx.commands.which_policy import (
 )
 from bounce_mjx.config.command_line import Flag, stdout
 from bounce_mjx.config.settings import Count, NonNegativeInt
-from bounce_mjx.config.user_code import import_flags
+from bounce_mjx.config.user_code import import_flags_of_classes
 from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation import config as evaluation
 from bounce_mjx.world.config import WorldConfig
@@ -96,6 +96,7 @@ def main(args: Sequence[str]) -> None:
     config = command.config_of(checkpoint, command.robot, world)
     if command.limits and config.env.robot.limits.velocity is None:
         raise UserError("the policy's arm has no command limits (env.robot.limits); omit --limits")
+    # In its own world, to say what does not change in another one.
     trained = command.config_of(checkpoint, command.robot)
     goals = given_goals.checked(config.env)
     set_up_jax(evaluation.on_engine(config.env, command.physics))
@@ -157,7 +158,7 @@ def main(args: Sequence[str]) -> None:
         if command.physics == "config":
             first_to_end = min(failures, key=lambda failure: failure.seconds)
             film = "--episode", str(first_to_end.episode)
-            imports = import_flags(config.env.task)
+            imports = import_flags_of_classes(config.env.task)
             print(f"film of one: {film_command(args, _NOT_OF_PLAY, *film, imports=imports)}")
     elif command.failures:
         print(f"no episode of {command.episodes:,} failed")

@@ -8,6 +8,7 @@ from bounce_mjx.commands.which_policy import WhichPolicy
 from bounce_mjx.config.command_line import Flag, parse
 
 
+# Without the mirror law, which has no network: not `OnePolicy`, and not `choose`.
 class ExportCommand(WhichPolicy):
     """Exports a trained policy, with the environment of its training, as an ONNX file."""
 

@@ -1,4 +1,5 @@
-"""The goals of a task as flags, such as `--target-height 0.5` of the task bounce."""
+"""The goals of a task as flags, such as `--target-height 0.5` of the task bounce. Those of a user's
+own task are flags where it is imported."""
 
 from collections.abc import Sequence
 from typing import Annotated, Any, NamedTuple, TypeVar

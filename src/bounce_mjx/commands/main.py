@@ -76,10 +76,10 @@ def main(args: Sequence[str] | None = None) -> None:
         with needed(f"bounce-mjx {name}", "bounce_mjx"):
             command = importlib.import_module(f"bounce_mjx.commands.{name}")
         try:
-            from bounce_mjx.config.user_code import run_imports
+            from bounce_mjx.config.user_code import do_imports
         except ImportError:
             # A robot's computer has no pydantic: doctor, which runs there, needs no code of a user.
             command.main(rest)
             return
         # The user's own tasks and algorithms, which then have names.
-        command.main(run_imports(rest, prog=("bounce-mjx", name)))
+        command.main(do_imports(rest, prog=("bounce-mjx", name)))

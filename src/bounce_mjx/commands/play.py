@@ -24,7 +24,7 @@ from bounce_mjx.evaluation.config import (
     EvaluationOptions,
 )
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.runs.worlds import AS_TRAINED
+from bounce_mjx.runs.worlds import OWN
 from bounce_mjx.viewers.options import MAX_ENVS, ViewerOptions
 from bounce_mjx.world.randomization import RandomizationConfig
 
@@ -73,7 +73,7 @@ def main(args: Sequence[str]) -> None:
     world = world_of_flags(command.world, command.randomization)
     if command.condition is not None:
         # The suite changes the named world, or that of the training.
-        world = AS_TRAINED
+        world = OWN
     if command.episode is not None:
         _check_episode(command)
     # Before the seconds that imports and the compilation take.

@@ -133,12 +133,12 @@ def _config_of_policy(command: RehearseCommand, policy: Path) -> "WorldConfig":
     """
     from bounce_mjx.deploy.environments import environment_config, with_settings
     from bounce_mjx.deploy.interface import robot_name
-    from bounce_mjx.runs.worlds import AS_TRAINED, TRAINING, settings_in_world
+    from bounce_mjx.runs.worlds import OWN, TRAINING, settings_in_world
 
     config = environment_config(policy=policy, world=command.world or TRAINING)
     if command.robot is None:
         return config
-    given = settings_in_world(config.task, AS_TRAINED, command.robot)
+    given = settings_in_world(config.task, OWN, command.robot)
     names = robot_name(config.mjcf), robot_name(given.mjcf)
     poses = config.default_joint_angles, given.default_joint_angles
     if names[0] != names[1] or poses[0] != poses[1]:
@@ -157,10 +157,10 @@ def _rehearse_motion(command: RehearseCommand, robot: Path) -> None:
     from bounce_mjx.deploy.trajectory import Trajectory, read_trajectory
     from bounce_mjx.identify.excitation import excite
     from bounce_mjx.rehearsal.camera import NoCamera
-    from bounce_mjx.runs.worlds import AS_TRAINED, NOMINAL, settings_in_world
+    from bounce_mjx.runs.worlds import NOMINAL, OWN, settings_in_world
 
     task = find_task(command.task or DEFAULT)
-    arms = settings_in_world(task, AS_TRAINED, robot)
+    arms = settings_in_world(task, OWN, robot)
     config = settings_in_world(arms, command.world or NOMINAL)
     if command.motion is None:
         planned = excite(config, _MOTION_SECONDS, 1.0)

@@ -16,7 +16,7 @@ from bounce_mjx.commands.which_policy import (
 )
 from bounce_mjx.config.command_line import Flag, parse, stdout
 from bounce_mjx.config.settings import Count, NonNegativeInt
-from bounce_mjx.config.user_code import import_flags
+from bounce_mjx.config.user_code import import_flags_of_classes
 from bounce_mjx.evaluation import config as evaluation
 
 # Flags that `play` lacks, which the command of a film leaves out; one that ends with = has a value.
@@ -106,7 +106,7 @@ def main(args: Sequence[str]) -> None:
     if lost and not command.assumed and command.physics == "config":
         worst = min(lost, key=lambda outcome: outcome.lasted)
         film = "--condition", worst.label, "--episode", str(worst.lost[0])
-        imports = import_flags(config.env.task)
+        imports = import_flags_of_classes(config.env.task)
         shown = film_command(args, _NOT_OF_PLAY, *film, imports=imports)
         print(f"film of one that ended: {shown}")
     sys.exit(0 if report.passed else 1)

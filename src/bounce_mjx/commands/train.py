@@ -17,10 +17,11 @@ from bounce_mjx.config.files import dump_with_sources, flat
 from bounce_mjx.config.settings import Count, NonNegativeInt, fields_in
 from bounce_mjx.errors import UserError
 from bounce_mjx.interrupt import in_daemon_thread, leave
-from bounce_mjx.runs.config import TrainConfig, imports_of
+from bounce_mjx.learning.registry import own_algorithm
+from bounce_mjx.runs.config import TrainConfig, import_flags_of_run
 from bounce_mjx.runs.layers import CommandLine, Layers, layers_on
 from bounce_mjx.runs.presets import default_preset, has_accelerator, has_plugin
-from bounce_mjx.runs.start import Choice, ChoiceFlags, Start, find_start
+from bounce_mjx.runs.start import Choice, FileFlags, Start, StartFlags, find_start
 
 PROG = "bounce-mjx train"
 ABOUT = "Trains a policy; by default, one that keeps the ball bouncing."
@@ -85,11 +86,11 @@ class TrainCommand(NamedTuple):
     said: Mapping[str, Any]
     """The values that are said of keys of the config, by dotted key."""
 
-    def settings(self, machine: Path | None = None) -> Settings:
+    def settings(self, machine: Path) -> Settings:
         """The settings of the training.
 
         Args:
-          machine: the machine's preset; None asks JAX, which starts its devices.
+          machine: the machine's preset.
 
         Raises:
           UserError: a file or a value is wrong, or a flag changes a key of the resumed run that
@@ -109,8 +110,8 @@ def fields_of_command(start: Start) -> dict[str, FieldInfo]:
 
 
 def read_command(args: Sequence[str]) -> TrainCommand:
-    """Reads a command line: first the word and the flags that decide which others there are, then
-    all.
+    """Reads a command line: first the word and the flags that decide, with it, which others there
+    are; then all.
 
     Raises:
       UserError: a flag is wrong, or there is no such task, policy, run or algorithm.
@@ -119,20 +120,16 @@ def read_command(args: Sequence[str]) -> TrainCommand:
     helps = {"-h", "--help", "--help-all"}.intersection(args)
     words = [word for word in args if word not in helps]
     word, after_word = _split_word(words)
-    first = parse(ChoiceFlags, after_word, prog=PROG, is_first=True)
-    start = find_start(word, first)
+    start_flags = parse(StartFlags, after_word, prog=PROG, is_first=True)
+    start = find_start(word, start_flags)
     fields = fields_of_command(start)
     if helps:
-        usual = layers_on(start, first, default_preset(has_plugin())).config()
+        files = parse(FileFlags, after_word, prog=PROG, is_first=True)
+        usual = layers_on(start, files, default_preset(has_plugin())).config()
         _print_help(fields, usual, is_short="--help-all" not in helps)
     given = read_flags(fields, words, prog=PROG, description=ABOUT, defaults={})
-    late_word = given.get("word")
-    if late_word != word:
-        # First refuses a word that is no start at all, such as a second value of a flag.
-        find_start(late_word, first)
-        raise UserError(
-            f"{late_word} is what the training begins with; give it first: {PROG} {late_word} ..."
-        )
+    if given.get("word") != word:
+        _refuse_late_word(given["word"], start_flags)
     flags = typed(TrainFlags, given, flag_names(fields), PROG)
     said = {key: value for key, value in given.items() if key in start.fields}
     return TrainCommand(start, flags, said)
@@ -144,6 +141,19 @@ def _split_word(words: Sequence[str]) -> tuple[str | None, Sequence[str]]:
     if words and not words[0].startswith("-"):
         return words[0], words[1:]
     return None, words
+
+
+def _refuse_late_word(late_word: str, start_flags: StartFlags) -> NoReturn:
+    """Refuses a word behind flags.
+
+    Raises:
+      UserError: always; of a word that nothing begins with, such as a second value of a flag,
+        `find_start` says so.
+    """
+    find_start(late_word, start_flags)
+    raise UserError(
+        f"{late_word} is what the training begins with; give it first: {PROG} {late_word} ..."
+    )
 
 
 def _print_help(fields: Mapping[str, FieldInfo], config: TrainConfig, is_short: bool) -> NoReturn:
@@ -169,9 +179,11 @@ def main(args: Sequence[str]) -> None:
 
 
 def _for_devices(command: TrainCommand, settings: Settings) -> Settings:
-    """The settings, read again with the preset for JAX's devices, which this starts, where a plugin
+    """The settings with the preset for JAX's devices, which this starts: read again where a plugin
     is installed and JAX finds no device for it."""
-    return settings if has_plugin() == has_accelerator() else command.settings()
+    expected = default_preset(has_plugin())
+    found = default_preset(has_accelerator())
+    return settings if found == expected else command.settings(found)
 
 
 def print_config(config: TrainConfig) -> None:
@@ -181,12 +193,24 @@ def print_config(config: TrainConfig) -> None:
       UserError: a training refuses it. What the devices and the robot's file allow is seen only as
         it starts.
     """
-    config.ppo.check_rollout(config.training_episode_steps)
+    if _is_ppo(config):
+        config.ppo.check_rollout(config.training_episode_steps)
     remarks = dict(config.sources)
     for key, steps in config.rounded_steps.items():
         if steps != getattr(config, key):
             remarks[key] += f"; in whole blocks {steps:,}"
     print(dump_with_sources(config.model_dump(mode="json"), remarks), end="")
+
+
+def _is_ppo(config: TrainConfig) -> bool:
+    """Whether the algorithm is PPO, or a subclass of it."""
+    own = own_algorithm(config.algorithm)
+    if own is None:
+        return True
+    # The user's own algorithm has imported JAX.
+    from bounce_mjx.learning.ppo import PPO
+
+    return issubclass(own, PPO)
 
 
 def train(command: TrainCommand, settings: Settings) -> None:
@@ -217,13 +241,14 @@ def train(command: TrainCommand, settings: Settings) -> None:
         layers, config = _for_devices(command, settings)
         console = stdout(quiet=not hosts.is_leader())
         callbacks = []
-        is_watched = flags.watch and hosts.is_leader()
-        if is_watched:
+        page = None
+        if flags.watch and hosts.is_leader():
             # Only a training run that is watched pays for this import.
             from bounce_mjx.training.watch import Address, TrainingPage
 
             address = Address(flags.watch_host, flags.watch_port, flags.watch_allow_host)
-            callbacks.append(TrainingPage(config, address, console))
+            page = TrainingPage(config, address, console)
+            callbacks.append(page)
         if flags.video:
             from bounce_mjx.training.video import EvaluationVideo
 
@@ -236,10 +261,10 @@ def train(command: TrainCommand, settings: Settings) -> None:
             # evaluation in another thread.
             leave(0)
         best = run.checkpoint.run
-        words = shlex.join([str(best), *imports_of(best)])
+        words = shlex.join([str(best), *import_flags_of_run(best)])
         say(console, f"measure it: bounce-mjx eval {words}")
         say(console, f"watch it: bounce-mjx play {words}")
-        if is_watched:
-            callbacks[0].wait()
+        if page is not None:
+            page.wait()
             # A thread that simulates cannot be stopped.
             leave(0)

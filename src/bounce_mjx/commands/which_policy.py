@@ -15,7 +15,7 @@ from bounce_mjx.resources import policy_folder
 from bounce_mjx.runs.config import TrainConfig, load_run_config, runs_folder
 from bounce_mjx.runs.layers import read_preset
 from bounce_mjx.runs.presets import named_file
-from bounce_mjx.runs.worlds import AS_TRAINED, World, read_named_world, settings_in_world
+from bounce_mjx.runs.worlds import OWN, World, read_named_world, settings_in_world
 from bounce_mjx.task.registry import DEFAULT, find_task
 from bounce_mjx.world.randomization import RandomizationConfig
 
@@ -63,7 +63,7 @@ OtherRandomization = Annotated[
 
 
 def world_of_flags(world: Path | None, randomization: RandomizationConfig) -> World:
-    """The world that a command's flags ask for; `AS_TRAINED` without one. --nominal is an option of
+    """The world that a command's flags ask for; `OWN` without one. --nominal is an option of
     the evaluation, `EvaluationOptions.nominal`, which fixes the goals too.
 
     Raises:
@@ -76,7 +76,7 @@ def world_of_flags(world: Path | None, randomization: RandomizationConfig) -> Wo
             "--randomization is given without a term of the world, such as "
             "--randomization.air-drag 0 0.2; give one, or omit it"
         )
-    return AS_TRAINED if world is None else world
+    return OWN if world is None else world
 
 
 def suite_conditions(
@@ -194,7 +194,7 @@ class WhichPolicy(StrictModel):
         return choose_checkpoint(path, folder)
 
     def config_of(
-        self, checkpoint: "Checkpoint", robot: Path | None = None, world: World = AS_TRAINED
+        self, checkpoint: "Checkpoint", robot: Path | None = None, world: World = OWN
     ) -> TrainConfig:
         """The config of a checkpoint's run, or that of the mirror law, the task's preset; with its
         environment in the world of the episodes.

@@ -3,7 +3,8 @@
 The name of a class is its class name in lower case, such as dribble of `class Dribble(Task)`; a
 task of an installed package has that of its entry point (`task/registry.py`). Nothing else ever
 runs a file: neither a config nor a run brings code into a process. A run has a copy of the code
-that it was trained with; code is compared by its content.
+that it was trained with, which the commands that a training prints import; code is compared by its
+content.
 """
 
 import importlib
@@ -70,7 +71,7 @@ def import_code(place: str | os.PathLike) -> None:
         _run(CodeFile(path, content))
 
 
-def run_imports(args: Sequence[str], prog: Sequence[str]) -> list[str]:
+def do_imports(args: Sequence[str], prog: Sequence[str]) -> list[str]:
     """Imports what a command line names with --import; its other words.
 
     Args:
@@ -133,7 +134,7 @@ def code_file_of(kind: type) -> CodeFile | None:
         return None
 
 
-def import_flags(*kinds: type) -> list[str]:
+def import_flags_of_classes(*kinds: type) -> list[str]:
     """The flags with which a later command imports these classes again; none for those of the
     package, and of no file."""
     paths: list[Path] = []
@@ -141,10 +142,10 @@ def import_flags(*kinds: type) -> list[str]:
         code_file = None if kind.__module__.startswith(_PACKAGE) else code_file_of(kind)
         if code_file is not None:
             paths.append(code_file.path)
-    return flags_to_import(paths)
+    return import_flags(paths)
 
 
-def flags_to_import(files: Iterable[Path]) -> list[str]:
+def import_flags(files: Iterable[Path]) -> list[str]:
     """The flags with which a command imports files."""
     return [word for file in dict.fromkeys(files) for word in (_FLAG, str(file))]
 

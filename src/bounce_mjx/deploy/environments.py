@@ -1,5 +1,6 @@
-"""An environment is made once: of a task, of a policy or of a run, in a world
-(`settings_in_world`), with settings on top. Every adapter takes the `Env` that `environment` gives.
+"""An environment for a user of Python: of a task, of a policy or of a run, in a world
+(`settings_in_world`), with settings on top. Every adapter takes the `Env` that `environment` gives;
+a command makes its own of the config that `WhichPolicy.config_of` gives.
 
 It is among the exported policies because an .onnx file is a policy with its environment, too.
 """
@@ -21,7 +22,7 @@ from bounce_mjx.resources import POLICIES, policy_path
 from bounce_mjx.robot.config import is_packaged
 from bounce_mjx.runs.config import load_run_config
 from bounce_mjx.runs.folders import run_of
-from bounce_mjx.runs.worlds import AS_TRAINED, NOMINAL, World, settings_in_world
+from bounce_mjx.runs.worlds import NOMINAL, OWN, World, settings_in_world
 from bounce_mjx.task.registry import (
     DEFAULT,
     find_task,
@@ -61,9 +62,9 @@ def environment(
       start: see `EnvironmentOf`; by default, the task bounce. A word that is both a task and a
         policy, such as catch, is the task.
       world: nominal for the model's own, which is that of a policy by default; training for the
-        worlds that a policy's training sampled, without its curriculum; as_trained for these as
-        they were, which is that of a task or a config by default; or a named world's file or name
-        in configs/worlds/.
+        worlds that a policy's training sampled, without its curriculum; own for these as they
+        were, and for that of a task or a config, of which it is the default; or a named world's
+        file or name in configs/worlds/.
       policy: a policy in place of `start`, or beside its task.
       robot: of a task, a config's file or its name in configs/robots/; or the settings `env.robot`.
       settings: fields of the task's config, on top. A group that is given in part keeps the other
@@ -97,7 +98,7 @@ def environment_config(
         return _of_policy(policy, start, world or NOMINAL, _path(robot), settings)
     own = start or DEFAULT
     task_or_config = find_task(own) if isinstance(own, str) else own
-    config = settings_in_world(task_or_config, world or AS_TRAINED, _path(robot))
+    config = settings_in_world(task_or_config, world or OWN, _path(robot))
     return with_settings(config, settings)
 
 

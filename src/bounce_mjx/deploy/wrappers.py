@@ -13,8 +13,8 @@ import numpy as np
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 
-# By the package that defines them. A class that is not here is refused, since the next release of a
-# library, or a user, may write any.
+# By the package that defines them. Another class is refused, since the next release of a library,
+# or a user, may write any; but not one that extends these and has the same acting (`_ACTING`).
 _CHANGE_NOTHING = {
     "gymnasium": {
         "Wrapper",
@@ -22,7 +22,6 @@ _CHANGE_NOTHING = {
         "RewardWrapper",
         "VectorRewardWrapper",
         "ArrayConversion",
-        "AsyncVectorEnv",
         "Autoreset",
         "ClipAction",
         "ClipReward",
@@ -44,7 +43,6 @@ _CHANGE_NOTHING = {
     "stable_baselines3": {
         "DummyVecEnv",
         "Monitor",
-        "SubprocVecEnv",
         "VecCheckNan",
         "VecEnvWrapper",
         "VecMonitor",
@@ -83,8 +81,8 @@ _IN_OTHER_PROCESSES = {"AsyncVectorEnv", "SubprocVecEnv"}
 
 
 def environments_in(env: Any) -> list[Env]:
-    """The environments on JAX in one of any library, also within its wrappers: one, or each of a
-    vector that differs from those before it.
+    """The `Env` in an environment of any library, also within wrappers; of a vector of different
+    ones, each.
 
     Raises:
       UserError: it holds none of this package, or is not known to leave the observations, the

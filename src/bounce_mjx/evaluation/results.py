@@ -26,7 +26,8 @@ class Report:
     recording: Annotated[InstanceOf[Recording] | None, Field(exclude=True)] = None
     """The first episodes, if they were recorded; not stored."""
     screening: bool = False
-    """Whether these are the few episodes of a screening, which did not pass."""
+    """Whether these are the few episodes of a screening, after which the evaluation ended, as the
+    policy could not become the best, whether they pass or not."""
 
     @property
     def passed(self) -> bool:

@@ -10,7 +10,9 @@ class Algorithm:
     """Base of every algorithm: of `PPO`, and of a user's own that is no `PPO`, such as SAC or that
     of another library. Once its module is imported, `--algorithm NAME` trains with it: the job
     evaluates, saves, resumes and reports as it does for PPO. Such a class has a `Config` and
-    `make_trainer`; a subclass of `PPO` needs neither.
+    `make_trainer`; a subclass of `PPO` needs neither. A library's training that is one loop, such
+    as brax's `ppo.train`, has to be divided into blocks, and its network given as a `Policy`; no
+    adapter of this package does that. (docs/algorithms.md)
     """
 
     Config: ClassVar[type[PPOConfig]] = PPOConfig

@@ -9,6 +9,7 @@
 | all settings of a training (`TrainConfig`), and those of a run, read again | `config.py` |
 | what a run's folder begins with | `creation.py` |
 | what a run's folder holds, and what finds runs and checkpoints | `folders.py` |
+| a run, for a user of Python (`Run`) | `training/run.py` |
 | where a checkpoint is (`Checkpoint`), and what it says of itself (`Record`) | `records.py` |
 | the arrays of a checkpoint, read and written | `checkpoints.py` |
 | the evaluations so far, and when results end a training | `progress.py` |

@@ -9,7 +9,7 @@ from pydantic import Field
 from pydantic.fields import FieldInfo
 
 from bounce_mjx.config.settings import Count, NonNegativeInt, Steps, StrictModel, fields_in
-from bounce_mjx.config.user_code import code_file_of, flags_to_import, not_imported
+from bounce_mjx.config.user_code import code_file_of, import_flags, not_imported
 from bounce_mjx.config.validation import ConfigT, unknown_key, validate
 from bounce_mjx.errors import UserError, warn_once
 from bounce_mjx.evaluation.config import DEFAULT_SEED
@@ -75,7 +75,8 @@ class TrainConfig(StrictModel):
     """ppo, or the name of an imported subclass of `bounce_mjx.learning.ppo.PPO` or
     `bounce_mjx.learning.algorithm.Algorithm`."""
     ppo: pydantic.SerializeAsAny[PPOConfig] = PPOConfig()
-    """The settings of the algorithm, those of its `Config`, also of one that is no PPO."""
+    """The settings of the algorithm, those of its `Config`, also of one that is no PPO: the presets
+    have this key, and every policy has the network that PPO's settings describe."""
     seed: NonNegativeInt = 0
     """Seed of the run."""
     num_seeds: Count = 1
@@ -96,7 +97,8 @@ class TrainConfig(StrictModel):
     keep_checkpoints: Count | Literal["all"] = 1
     """Newest checkpoints that stay, or all, in addition to the one of the best evaluation. Of
     several seeds these are the run's, which hold the state of all seeds; a seed's own folder has
-    its best one."""
+    its best one. Of a run that is resumed from an older checkpoint, the next save removes the later
+    ones."""
     eval_episodes: Count = 1024
     """Episodes of an evaluation of the results."""
     screening_episodes: NonNegativeInt = 0
@@ -104,10 +106,11 @@ class TrainConfig(StrictModel):
     best. 0 for all at once."""
     eval_seed: EvalSeed = 10_000
     """Seed of the evaluations during training; not that of `bounce-mjx eval`."""
+    # The margin is `Report.passed_with_margin`, the end `Progress.wait_is_over`.
     stop_when_solved: bool = False
     """End once an evaluation meets all results with a margin, so clearly that 64 other episodes
     should meet them too (they are not run). Where no margin comes, end with the evaluation after
-    1.5 times the steps of the first one, after step 0, that meets all."""
+    1.5 times the steps of the first trained policy that met all."""
     warm_start: Path | None = None
     """Run, or policy of the package, from whose networks and environment the training starts."""
     log_dir: Path = Field(default_factory=_default_log_dir)
@@ -185,6 +188,8 @@ class TrainConfig(StrictModel):
     @pydantic.field_validator("env", mode="before")
     @classmethod
     def _read_env(cls, env: Any, info: pydantic.ValidationInfo) -> Any:
+        """Plain settings as those of the named task; `runs.layers` gives settings that are
+        typed."""
         if "task" not in info.data:
             return env
         if isinstance(env, WorldConfig):
@@ -342,7 +347,7 @@ def copied_code(run: Path, key: str) -> Path | None:
     return files[0] if files else None
 
 
-def imports_of(run: Path, *, to_train: bool = False) -> list[str]:
+def import_flags_of_run(run: Path, *, to_train: bool = False) -> list[str]:
     """The flags with which a later command about a run imports the user's own code: the run's
     copies, which are what it was trained with, wherever it is moved to and whatever became of the
     user's own file since.
@@ -359,7 +364,7 @@ def imports_of(run: Path, *, to_train: bool = False) -> list[str]:
         )
         if is_new:
             copies.append(copy)
-    return flags_to_import(copies)
+    return import_flags(copies)
 
 
 def is_as_copied(kind: type, run: Path, key: str) -> bool:

@@ -12,9 +12,9 @@ a run's folder, or of a seed's, which looks like one (`training.run.Run` reads i
         robustness.*, failures.png      of the commands `robustness` and `eval --failures`
         checkpoints/<number>/           the newest states, as many as keep_checkpoints says, and
                                         the best evaluation
-            policy/                     the policy's arrays; not in a run's own of several seeds
-            training/                   the training state's arrays; optional
-            networks/                   both networks, for another training; optional
+            policy/                     the policy's arrays
+            training/                   the training state's arrays; only what a run resumes from
+            networks/                   both networks, for another training; not of every algorithm
             record/                     the steps, the config, the evaluations so far and its own
             manifest.json               size and SHA-256 of every other file
         checkpoints/<number>.damaged    a damaged one, which a resumed training has set aside
@@ -22,7 +22,8 @@ a run's folder, or of a seed's, which looks like one (`training.run.Run` reads i
 A checkpoint's number is that of the steps trained; see `Checkpoint`.
 
 A run with several seeds has one folder per seed, such as seed_003/, with the layout of a run with
-one seed; the run's own checkpoints/ holds the state of all seeds.
+one seed and its best checkpoint, without training/. The run's own checkpoints/ hold the state of
+all seeds: training/ and record/ alone.
 
 What finds them, and raises a `UserError` where there is nothing:
 

@@ -1,8 +1,9 @@
 """The settings of a training, from wherever they come.
 
-One word fixes the classes (`start.py`): which task, which algorithm and which policy or run a
-training begins with. Everything else is values. They are layers, in the order of `Rank`, and a
-later one wins.
+The first word, --algorithm and --warm-start fix the classes (`start.py`): which task, which
+algorithm and which policy or run a training begins with. Everything else is values. They are layers
+(`Layer`), in the order of `Rank`, and a later one wins. Those of the environment alone, of a
+policy, a robot and a world, are in `worlds.py`.
 
 `layers_on` reads the layers below the user's, each file once. `Layers.config` puts the user's on
 top, merges all of them and validates the result, once; the config then knows what set each of its
@@ -64,8 +65,10 @@ class Rank(enum.StrEnum):
 
 FLAGS = "flags"
 """Source of the settings on a command line."""
-PYTHON = "train"
-"""Source of the arguments of `train`."""
+PYTHON = "train()"
+"""Source of the arguments of `train` in Python."""
+BEYOND_RESULTS = "more steps, after the results had ended the run"
+"""Source of a `stop_when_solved` that is switched off (`Layers._beyond_results`)."""
 
 
 # Reading: what lies on what ---------------------------------------------------------------------
@@ -96,66 +99,38 @@ def layers_on(start: Start, files: FileFlags, machine: Path | None = None) -> "L
         given = {"config": files.config, "robot": files.robot, "world": files.world}
         check_not_given(start.place, given)
         return Layers(start, (Layer(f"the run {start.place}", start.resumed_config.model_dump()),))
+    layers: dict[Rank, list[Layer]] = {rank: [] for rank in Rank}
     if start.whole is None:
-        read = _layers_of_config(start, files.config, machine)
+        read = preset_files(files.config, start.task_name, machine)
+        layers[Rank.MACHINE] = _layers_of_files(read.machine)
+        layers[Rank.PRESET] = _layers_of_files(read.preset)
+        layers[Rank.FILES] = _layers_of_files(read.files)
+        for layer in (*layers[Rank.PRESET], *layers[Rank.FILES]):
+            _check_start(layer, start)
     else:
-        read = _layers_of_whole(start.whole, start.warm_start)
-    changed = _changed_defaults(start.algorithm_config)
+        # Its warm start is the checkpoint that was found for it.
+        whole = start.whole.model_dump() | {"warm_start": start.warm_start}
+        layers[Rank.FILES] = [Layer("config", whole, replaces=("env", "ppo"))]
+    layers[Rank.ALGORITHM] = _changed_defaults(start.algorithm_config)
     trained = None if start.warm_config is None else start.warm_config.env
     of_env = layers_of_environment(start.task, trained, files.robot, files.world)
     for layer in of_env.robot:
         _check_start(layer, start)
-    policies = [_with_networks(layer, start) for layer in of_env.policy]
-    changes = _notes(changed, read.preset, "ppo.") + _notes(read.preset, policies, "env.")
-    layers: dict[Rank, list[Layer]] = {
-        Rank.MACHINE: read.machine,
-        Rank.ALGORITHM: changed,
-        Rank.PRESET: read.preset,
-        Rank.WARM_START: policies,
-        Rank.FILES: read.files,
-        Rank.ROBOT: of_env.robot,
-        Rank.WORLD: of_env.world,
-    }
-    below = [layer for rank in Rank for layer in layers.get(rank, [])]
-    return Layers(start=start, below=tuple(below), notes=(*start.notes, *changes))
-
-
-class ConfigLayers(NamedTuple):
-    """The settings that `--config` stands for, as `PresetFiles`."""
-
-    machine: list[Layer]
-    """One layer or none."""
-    preset: list[Layer]
-    """One layer or none."""
-    files: list[Layer]
-
-
-def _layers_of_config(start: Start, config: Sequence[Path], machine: Path | None) -> ConfigLayers:
-    """The layers of presets and files.
-
-    Raises:
-      UserError: a file is missing, wrong, or of another start.
-    """
-    read = ConfigLayers(*map(_layers_of_files, preset_files(config, start.task_name, machine)))
-    for layer in (*read.preset, *read.files):
-        _check_start(layer, start)
-    return read
-
-
-def _layers_of_whole(whole: TrainConfig, warm_start: Path | None) -> ConfigLayers:
-    """The layer of a whole config of Python, which has no preset below it.
-
-    Args:
-      warm_start: the policy that was found for its own.
-    """
-    values = whole.model_dump() | {"warm_start": warm_start}
-    return ConfigLayers([], [], [Layer("config", values, replaces=("env", "ppo"))])
+    layers[Rank.WARM_START] = [_with_networks(layer, start) for layer in of_env.policy]
+    layers[Rank.ROBOT] = of_env.robot
+    layers[Rank.WORLD] = of_env.world
+    notes = (
+        *start.notes,
+        *_notes(layers[Rank.ALGORITHM], layers[Rank.PRESET], "ppo."),
+        *_notes(layers[Rank.PRESET], layers[Rank.WARM_START], "env."),
+    )
+    return Layers(start, tuple(layer for rank in Rank for layer in layers[rank]), notes)
 
 
 def _check_start(layer: Layer, start: Start) -> None:
-    """Checks that a file, which has values alone, is of what the training begins with. The word
-    alone says the task. An algorithm or a warm start that the user names wins over the file's, as
-    any flag does.
+    """Checks that a file, which has values alone, is of what the training begins with: no file says
+    the task. An algorithm or a warm start that the user names wins over the file's, as any flag
+    does.
 
     Raises:
       UserError: it is of another task, or of an algorithm or a warm start that the user does not
@@ -168,7 +143,7 @@ def _check_start(layer: Layer, start: Start) -> None:
     }
     for key, (ours, remedy) in begun.items():
         theirs = layer.values.get(key)
-        wins = key != "task" and key in start.said
+        wins = key != "task" and key in start.named
         if theirs is not None and theirs != ours and not wins:
             raise UserError(
                 f"{layer.source} is of the {key} {theirs}, and this training of {ours or 'none'}; "
@@ -266,7 +241,8 @@ class Layers:
         Args:
           said: values by their keys. A key may be dotted, and one of `env` or `ppo` stand alone:
             num_envs for ppo.num_envs.
-          command: where the user says it; None in Python.
+          command: where the user says it, which its errors and the source of its values name; None
+            in Python.
 
         Raises:
           UserError: a key is unknown, a value is out of range, or it must be that of the resumed
@@ -274,7 +250,7 @@ class Layers:
         """
         user_source = PYTHON if command is None else FLAGS
         # The policy of a warm start is the checkpoint that was found, not the word for it.
-        user = self._layer_of_user(user_source, {**(said or {}), **self.start.said})
+        user = self._layer_of_user(user_source, {**(said or {}), **self.start.named})
         above = [*self._beyond_results(user), user]
         layers = [*self.below, *above]
         for layer in layers:
@@ -353,7 +329,7 @@ class Layers:
         progress = verify(checkpoint).progress
         seeds = [Progress.model_validate(seed) for seed in progress.get("seeds", [progress])]
         if waits_are_over(seeds):
-            return [Layer(user.source, {"stop_when_solved": False})]
+            return [Layer(BEYOND_RESULTS, {"stop_when_solved": False})]
         return []
 
     def _validated(self, values: dict[str, Any]) -> TrainConfig:
@@ -396,11 +372,11 @@ def _merge(layers: Sequence[Layer]) -> tuple[dict[str, Any], dict[str, str]]:
         if layer.is_world:
             randomization = without_idle_curriculum(values["env"]["randomization"])
             values["env"] = values["env"] | {"randomization": randomization}
-        for key in flat(layer.values):
-            # As the last key, by which `TrainConfig.sources` tells the source of a mapping, such as
-            # `shares`, whose entries may have several.
-            sources.pop(key, None)
-            sources[key] = layer.source
+        its_keys = flat(layer.values)
+        kept = {key: source for key, source in sources.items() if key not in its_keys}
+        # The newest keys come last: `TrainConfig.sources` gives a mapping such as `shares`, whose
+        # entries may have several sources, the last of these.
+        sources = kept | dict.fromkeys(its_keys, layer.source)
     # A later layer may end a value, or replace a mapping by None.
     remaining = flat(values)
     return values, {key: source for key, source in sources.items() if key in remaining}

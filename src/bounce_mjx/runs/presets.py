@@ -61,8 +61,11 @@ def preset_files(config: Sequence[Path], task: str, machine: Path | None = None)
       UserError: a file is missing or invalid, or names a base that is not used.
     """
     of_task = f"{PRESETS}/{task}"
-    # The task's own first; a word that is none of these is looked for in the presets of all tasks.
-    paths = [named_file(named_file(path, of_task), PRESETS, "preset") for path in config]
+    paths = []
+    for word in config:
+        # The task's own first; a word that is none of these is one of the presets of all tasks.
+        own = named_file(word, of_task)
+        paths.append(named_file(own, PRESETS, "preset"))
     files = [ConfigFile(path, read_config_file(path)) for path in paths]
     for file in files[1:]:
         if file.values.get(BASE) is not None:
@@ -70,19 +73,19 @@ def preset_files(config: Sequence[Path], task: str, machine: Path | None = None)
                 f"{file.path} lies on {paths[0]}, so its {BASE} is not used; give it first"
             )
     if not files or BASE not in files[0].values:
-        # The first file is silent: on the machine's.
+        # The first file does not say on what it lies: on the machine's preset.
         base = machine or default_preset(has_accelerator())
         return PresetFiles(_preset(str(base), of_task), [], files)
     base = files[0].values[BASE]
     if base is not None:
-        # It names one.
+        # On the one that it names.
         preset = _preset(str(base), of_task)
         if not preset:
             raise UserError(
                 f"{paths[0]}: {BASE} is {shorten(repr(base))}; give the name of a preset, or null"
             )
         return PresetFiles([], preset, files)
-    # It stands alone: a preset of the package, or a file of the user's.
+    # On nothing (`base: null`): it is a preset of the package, or a file of the user's.
     if paths[0].resolve().is_relative_to(resource_path(PRESETS).resolve()):
         return PresetFiles([], files[:1], files[1:])
     return PresetFiles([], [], files)

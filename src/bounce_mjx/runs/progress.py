@@ -27,7 +27,8 @@ class Progress(pydantic.BaseModel):
     best_steps: int = 0
     solved_steps: int | None = None
     """Steps at the first evaluation that met all results, with a margin or without: the end of the
-    time "to all five results" (of bounce) in every measurement."""
+    time "to all five results" (of bounce) in every measurement. `stop_when_solved` ends the
+    training later, see `wait_is_over`."""
     solved_seconds: float | None = None
     """Seconds from the setup of this training, or of its last resumption, to the end of that
     evaluation."""
@@ -44,11 +45,11 @@ class Progress(pydantic.BaseModel):
 
     @property
     def wait_is_over(self) -> bool:
-        """Whether a margin has come, or the wait for it is over."""
+        """Whether a margin has come, also to the policy of a warm start at step 0, or the wait for
+        it is over."""
         if self.margin_steps is not None:
             return True
-        # A warm start with a margin needs no training. One without it has to be trained, as the
-        # wait would be over before the first step.
+        # The wait is counted from a trained policy: from step 0 it would be over at once.
         met = [e["steps"] for e in self.evaluations if e["passed"] and e["steps"] > 0]
         return bool(met) and self.evaluations[-1]["steps"] >= PATIENCE * met[0]
 

@@ -24,8 +24,8 @@ class Checkpoint(NamedTuple):
     folder: Path
     """The checkpoint's own folder."""
     number: int
-    """The name of its folder: the environment steps trained, or one more than the largest number in
-    the run where that is as large, so that the newest checkpoint has the largest one."""
+    """The name of its folder: the environment steps trained; where the run has a number as large,
+    one more than its largest. So the newest checkpoint has the largest number."""
 
     @property
     def steps(self) -> int:

@@ -1,4 +1,5 @@
-"""What a training begins with: one word fixes the classes of its settings."""
+"""What a training begins with, which fixes the classes of its settings: the first word, and the
+flags --algorithm and --warm-start beside it."""
 
 import os
 from collections.abc import Mapping
@@ -52,12 +53,8 @@ class FileFlags(StrictModel):
     (ur5e_rtde, panda_fci, iiwa_fri or fast_servo). It may have a robot."""
 
 
-class ChoiceFlags(StartFlags, FileFlags):
-    """The flags that decide which layers there are."""
-
-
-class Choice(ChoiceFlags):
-    """The first word and those flags: all that decides which layers there are."""
+class Choice(StartFlags, FileFlags):
+    """The first word and these flags: all that decides which layers there are."""
 
     word: Annotated[
         str | None,
@@ -80,7 +77,7 @@ class Start(NamedTuple):
     algorithm_config: type[PPOConfig]
     """Type of the settings of the algorithm."""
     algorithm_name: str
-    said: dict[str, Any]
+    named: dict[str, Any]
     """What the user names of it, by the keys of the config: the task, the algorithm, the policy of
     a warm start. It wins over every layer."""
     warm_start: Path | None = None
@@ -103,8 +100,8 @@ class Start(NamedTuple):
 
 
 def find_start(word: str | None, flags: StartFlags, whole: TrainConfig | None = None) -> Start:
-    """What the first word means: a task, a policy or a run; and what is said beside it. A word that
-    is a task and more is the task; a folder of a policy's name wins over the policy of the package
+    """What the first word means: a task, a policy or a run; and what the flags beside it name. A
+    task wins over a policy or a folder of its name; a folder over a policy of the package
     (`resources.policy_folder`).
 
     Args:
@@ -125,6 +122,7 @@ def find_start(word: str | None, flags: StartFlags, whole: TrainConfig | None = 
     # Imports JAX, which a task's help does not need.
     from bounce_mjx.runs.folders import LATEST, means_newest
 
+    # The word latest, or a folder.
     if means_newest(Path(word)) or os.path.isdir(word):
         return _start_of_run(Path(word), flags, whole)
     if os.path.isfile(word):
@@ -137,37 +135,39 @@ def find_start(word: str | None, flags: StartFlags, whole: TrainConfig | None = 
 
 
 def _new_start(
-    word: str | None, named: Path | None, flags: StartFlags, whole: TrainConfig | None
+    word: str | None, named_policy: Path | None, flags: StartFlags, whole: TrainConfig | None
 ) -> Start:
     """The start of a new run.
 
     Args:
       word: the task, if the user names it.
-      named: the policy of a warm start, if the user names it.
+      named_policy: the policy of a warm start, if the user names it. The training is of its task,
+        unless the word is another one, and of its environment and networks, but not of its
+        algorithm: without --algorithm that is PPO.
     """
-    said: dict[str, Any] = {}
-    warm_start = named
-    if named is None and whole is not None:
+    named: dict[str, Any] = {}
+    warm_start = named_policy
+    if named_policy is None and whole is not None:
         warm_start = whole.warm_start
     warm_config: TrainConfig | None = None
     notes: tuple[str, ...] = ()
     if warm_start is not None:
         folder = _folder_of_runs(flags.log_dir, word, whole)
         warm_start, warm_config, notes = _policy_of(warm_start, folder)
-    if named is not None:
-        said["warm_start"] = warm_start
+    if named_policy is not None:
+        named["warm_start"] = warm_start
     task = _task_of(word, whole, warm_config)
     if word is not None:
-        said["task"] = task_name(task)
+        named["task"] = task_name(task)
     algorithm_name, algorithm_config = _algorithm(flags.algorithm, whole)
     if flags.algorithm is not None:
-        said["algorithm"] = algorithm_name
+        named["algorithm"] = algorithm_name
     return Start(
         task=task,
         task_name=task_name(task),
         algorithm_config=algorithm_config,
         algorithm_name=algorithm_name,
-        said=said,
+        named=named,
         warm_start=warm_start,
         warm_config=warm_config,
         whole=whole,
@@ -252,7 +252,7 @@ def _start_of_run(word: Path, flags: StartFlags, whole: TrainConfig | None) -> S
         task_name=config.task,
         algorithm_config=type(config.ppo),
         algorithm_name=config.algorithm,
-        said={},
+        named={},
         place=place,
         resumed_config=config,
     )

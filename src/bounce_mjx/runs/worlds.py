@@ -1,5 +1,7 @@
 """The settings of the environment of a task, or of a policy's training, in a world:
-`settings_in_world`; `deploy.environments.environment` makes the `Env`.
+`settings_in_world`. `deploy.environments.environment` makes the `Env`. What acts with a policy
+where it was trained, such as `export`, takes the settings of its run as they are
+(`load_run_config`).
 
 They are layers (`Layer`), the lowest first: what the policy was trained in, its robot, and
 its world (`layers_of_environment`). A training has further layers between them (`runs/layers.py`).
@@ -23,20 +25,20 @@ from bounce_mjx.world.config import WorldConfig
 from bounce_mjx.world.named import CURRICULUM, NamedWorld, read_world
 from bounce_mjx.world.randomization import RandomizationConfig
 
-AS_TRAINED = "as_trained"
-"""World: the start's own, as it is: of a policy, each that its training sampled; of a task, that of
-its defaults."""
+OWN = "own"
+"""World: the own one, as it is: of a policy, each that its training sampled; of a task, that of its
+defaults."""
 TRAINING = "training"
 """World: each that a policy's training sampled, without its curriculum."""
 NOMINAL = "nominal"
-"""World: the model's own; the goals stay as they are. (`EvaluationOptions.nominal`, the flag
---nominal of `eval`, is this world and fixed goals.)"""
+"""World: the model's; the goals stay as they are. (`EvaluationOptions.nominal`, the flag --nominal
+of `eval`, is this world and fixed goals: `evaluation.policy_evaluation.setup_of`.)"""
 
 World = str | os.PathLike | RandomizationConfig
-"""`AS_TRAINED`, `TRAINING` or `NOMINAL`; the file of a named world, or its name in configs/worlds/;
+"""`OWN`, `TRAINING` or `NOMINAL`; the file of a named world, or its name in configs/worlds/;
 or, of a policy, the terms of a user's own. Where a user may leave the world out, `None` is replaced
 by one of these at once: of a policy, `environment` and `Run.env` take `NOMINAL`, `eval` and `play`
-`AS_TRAINED`, `rehearse` `TRAINING`."""
+`OWN`, `rehearse` `TRAINING`."""
 
 
 class Layer(NamedTuple):
@@ -66,40 +68,41 @@ class EnvironmentLayers(NamedTuple):
 
 
 def settings_in_world(
-    start: type[Task] | WorldConfig, world: World, robot: Path | None = None
+    task_or_config: type[Task] | WorldConfig, world: World, robot: Path | None = None
 ) -> WorldConfig:
     """The settings of the environment of a task, or of a policy's training with its observation and
     its actions, in a world.
 
     Args:
-      start: a task, or the config of a policy's environment.
+      task_or_config: a task, or the config of a policy's environment.
       robot: of a task: a file, or a name in configs/robots/.
 
     Raises:
       UserError: the robot or the world is missing or wrong, the world is of another robot, a policy
         or a term does not fit the arm, or a task has no training's worlds.
     """
-    if isinstance(start, WorldConfig):
-        _check_one_robot(start, robot)
-        if world == AS_TRAINED:
-            return start
-        if world == NOMINAL:
-            return start.in_world(RandomizationConfig())
+    if not isinstance(task_or_config, WorldConfig):
+        task = task_or_config
         if world == TRAINING:
-            ended = {"warmup_steps": 0, "first_goal_range": 1.0}
-            randomization = start.randomization.model_copy(update=ended)
-            return start.model_copy(update={"randomization": randomization})
-        if isinstance(world, RandomizationConfig):
-            given = dict(start.in_world(world))
-            return validate(type(start), given, "the flags --randomization")
-        layers = layers_of_environment(type(start).task, start, None, Path(world))
-        return _merged(type(start), layers)
+            raise UserError(
+                f"the world {TRAINING} is that of a policy; give a policy, or a named world"
+            )
+        named = None if world in (OWN, NOMINAL) else Path(world)
+        return _merged(task.Config, layers_of_environment(task, None, robot, named))
+    config = task_or_config
+    _check_one_robot(config, robot)
+    if world == OWN:
+        return config
+    if world == NOMINAL:
+        return config.in_world(RandomizationConfig())
     if world == TRAINING:
-        raise UserError(
-            f"the world {TRAINING} is that of a policy; give a policy, or a named world"
-        )
-    named = None if world in (AS_TRAINED, NOMINAL) else Path(world)
-    return _merged(start.Config, layers_of_environment(start, None, robot, named))
+        ended = {"warmup_steps": 0, "first_goal_range": 1.0}
+        randomization = config.randomization.model_copy(update=ended)
+        return config.model_copy(update={"randomization": randomization})
+    if isinstance(world, RandomizationConfig):
+        return validate(type(config), dict(config.in_world(world)), "the randomization")
+    layers = layers_of_environment(type(config).task, config, None, Path(world))
+    return _merged(type(config), layers)
 
 
 def _check_one_robot(trained: WorldConfig | None, robot: Path | None) -> None:

@@ -73,8 +73,8 @@ def share_of_episodes(name: str, measured: str, met: np.ndarray, least: float) -
       name: of the result.
       measured: description of the measured quantity.
       met: whether each episode meets the condition [E], bool.
-      least: least share, from 0 to 1; 1 leaves no room for a margin, and training to it does not
-        stop early.
+      least: least share, from 0 to 1; 1 leaves no room for a margin, so that a training that stops
+        when solved waits for one in vain (`runs.progress.PATIENCE`).
 
     Raises:
       UserError: the least share is not from 0 to 1.

@@ -20,8 +20,8 @@ from bounce_mjx.runs.checkpoints import policy_shapes
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.runs.progress import Progress
 from bounce_mjx.training import hosts
-from bounce_mjx.training.ppo_trainer import each_seed
 from bounce_mjx.training.setup import compiler_options
+from bounce_mjx.training.trainer import each_seed
 
 Tree = TypeVar("Tree")
 Chunk = Measured

@@ -18,7 +18,7 @@ MAX_REWARD = 1e4
 """Largest mean of a reward term in an iteration, times `ppo.reward_scale`."""
 
 
-def first_block_fault(metrics: BlockMetrics, config: TrainConfig) -> str | None:
+def why_unlearnable(metrics: BlockMetrics, config: TrainConfig) -> str | None:
     """What is wrong with the first block, as a sentence; None if it can be learned from. Settings
     that no policy can learn with show there, before anything that was trained is saved, and in
     every seed.

@@ -73,7 +73,7 @@ def join(
         ) from error
 
 
-def agree(config: TrainConfig, resume: Path | None) -> None:
+def check_equal_configs(config: TrainConfig, resume: Path | None) -> None:
     """Compares the configs of all processes.
 
     Args:
@@ -111,7 +111,7 @@ def exchange(value: Any) -> list[Any]:
         text = processes.client.blocking_key_value_get(f"bounce_mjx/{number}/{i}", _NO_LIMIT_MS)
         values.append(json.loads(text))
     if number > 0:
-        # Each process has come here, and so has read all values of the exchange before.
+        # Every process has set its value of this exchange, and so has read all of the one before.
         processes.client.key_value_delete(f"bounce_mjx/{number - 1}/{processes.process_id}")
     return values
 

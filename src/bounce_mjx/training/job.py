@@ -15,6 +15,13 @@ did before the training: in a command, it ends the process at once (`StopRequest
 before it stays.
 An exception in a callback takes the way of a first signal, and is raised at its end; the callback
 is called no more.
+
+| the first signal comes | what a command does (`open_job` enters `StopRequest`) | exit status |
+|---|---|---|
+| before the run's folder is made | ends at once, by the signal's default action | of the signal |
+| before there is anything to save | raises `Interrupted`; a new folder is removed | 130 |
+| later | saves what is new, raises `TrainingStopped` | 0 |
+| while the report is drawn | leaves it out, raises `TrainingStopped` (`run.leave_report`) | 0 |
 """
 
 import concurrent.futures
@@ -41,7 +48,7 @@ from bounce_mjx.learning.registry import find_algorithm
 from bounce_mjx.physics.convergence import solver_warning
 from bounce_mjx.resources import VERSION
 from bounce_mjx.runs import checkpoints, creation, folders
-from bounce_mjx.runs.config import TrainConfig, imports_of
+from bounce_mjx.runs.config import TrainConfig, import_flags_of_run
 from bounce_mjx.runs.progress import PATIENCE, Progress, waits_are_over
 from bounce_mjx.runs.storage import lock_run, writable
 from bounce_mjx.training import events, faults, hosts
@@ -84,10 +91,11 @@ def train(
         another process trains in the run's folder, the hosts have different configs, a device
         failed, the training diverged, or its final state could not be saved.
       TrainingStopped: SIGINT, SIGTERM or SIGHUP came; the state is saved.
-      Interrupted: the signal came before the first block, or before the policy of a warm start was
-        evaluated; a new run's folder is removed, and a command exits with 130.
+      Interrupted: the signal came before there was anything to save: in a new run, before the first
+        block or the evaluation of the policy of a warm start; in a resumed one, during the
+        compilation. A new run's folder is removed, and a command exits with 130.
     """
-    hosts.agree(config, resume)
+    hosts.check_equal_configs(config, resume)
     with contextlib.ExitStack() as stack:
         job = open_job(config, console, stack, resume, callbacks)
         try:
@@ -100,7 +108,8 @@ def train(
                 if job.must_stop() or job.ends_here():
                     break
                 metrics, seconds = job.train_block()
-                job.log_block(metrics, seconds)
+                job.tell_block(metrics, seconds)
+                job.end_diverged(metrics["fault"])
             job.finish()
         except jax.errors.JaxRuntimeError as error:
             raise UserError(job.describe_failure(error)) from error
@@ -129,7 +138,7 @@ def open_job(
     trainer = make_trainer(config, env)
     is_warm = config.warm_start is not None and resume is None
     networks = checkpoints.read_warm_start(config, env) if is_warm else None
-    # Before, a signal ends the process by its default action.
+    # Until here, a signal does what it does without a training: in a command, it ends the process.
     stop = stack.enter_context(StopRequest())
     run = _make_run(config) if resume is None else folders.run_of(resume)
     job = Job(
@@ -244,7 +253,7 @@ class Job:
         for seed, plain in zip(self.seeds, evaluated, strict=True):
             seed.recall(Progress.model_validate(plain))
             # With one seed, what was trained after a checkpoint that the user named does not count
-            # any more. A seed's own folder has its best policy alone.
+            # any more, and the next save removes it. A seed's own folder has its best policy alone.
             seed.recall_best(newest=checkpoint if seed.run == self.run else None)
         numbers = [stored.number for stored in folders.stored_checkpoints(self.run)]
         self.saver.recall(number for number in numbers if number <= checkpoint.number)
@@ -394,7 +403,9 @@ class Job:
         return hosts.any_of(self.stop.requested or self.failure is not None)
 
     def ends_here(self) -> bool:
-        """Whether the training ends here: by its steps, by a callback, or by its results."""
+        """Whether the training ends here: by its steps, by a callback, or by its results. All hosts
+        know it without a further exchange: they have the same steps and reports, and learn from
+        `tell` what a callback answers, and from `Saver.collect` which evaluations are saved."""
         return self.ends_by_steps() or self.ended_by_callback or self.ends_by_results()
 
     def train_block(self) -> tuple[BlockMetrics, float]:
@@ -410,7 +421,7 @@ class Job:
             self.say("stopping after this block; Ctrl-C or SIGTERM ends the training at once")
         metrics = block.result()
         seconds = time.perf_counter() - started
-        if self.steps == 0 and (wrong := faults.first_block_fault(metrics, self.config)):
+        if self.steps == 0 and (wrong := faults.why_unlearnable(metrics, self.config)):
             raise UserError(f"these settings cannot be trained: {wrong}")
         self.steps += self.steps_per_block
         self.needs_save = True
@@ -418,16 +429,13 @@ class Job:
             seed.report = None
         return metrics, seconds
 
-    def log_block(self, metrics: BlockMetrics, seconds: float) -> None:
-        """Says and logs a block.
-
-        Raises:
-          UserError: every seed has diverged.
-        """
-        block_faults = metrics.pop("fault")
+    def tell_block(self, metrics: BlockMetrics, seconds: float) -> None:
+        """Says a block, and tells the callbacks, such as the log, of which one may end the
+        training."""
         rate = len(self.seeds) * self.steps_per_block / seconds
-        metrics["speed/steps_per_second"] = np.full((len(self.seeds), 1), rate)
-        points = events.block_points(metrics)
+        shown = {name: values for name, values in metrics.items() if name != "fault"}
+        shown["speed/steps_per_second"] = np.full((len(self.seeds), 1), rate)
+        points = events.block_points(shown)
         is_first = "train" not in self.clock.seconds
         left = None if is_first else self.clock.left(self.steps, self.config.total_steps)
         if is_first:
@@ -438,7 +446,6 @@ class Job:
             self.say(f"states that were not finite, whose environments were reset: {total:,}")
         pairs = zip(self.seeds, points, strict=True)
         self.tell([self.event(seed, seed_points) for seed, seed_points in pairs])
-        self.end_diverged(block_faults)
         # With the callbacks.
         self.clock.lap("train")
 
@@ -452,21 +459,23 @@ class Job:
           UserError: the state could not be saved.
           BaseException: what a callback raised.
         """
-        is_early = self.must_stop()
+        was_stopped = self.must_stop()
         # The policy of a warm start is saved once it is evaluated.
         has_nothing = self.is_new and self.steps == 0 and not self.is_evaluated()
-        if is_early and has_nothing:
+        if was_stopped and has_nothing:
             jax.distributed.shutdown()
             raise self.failure or Interrupted
-        if not is_early:
+        if not was_stopped:
             self.say(self.why_it_ends())
         if self.needs_save:
             self.save()
         self.end_last_save("the end of the training is lost")
         where = ""
-        if not is_early:
+        if not was_stopped:
             is_measured = self.evaluate_best()
-            where = f", {'after' if is_measured else 'before'} the final evaluation"
+            where = ", before the final evaluation"
+            if is_measured:
+                where = f", at the end of the training; the results are in {self.run}"
         # A signal may have come during the last save, too.
         must_stop = self.must_stop()
         # Every process waits here for the others; after this, none needs another.
@@ -610,7 +619,7 @@ class Job:
     @property
     def continuing(self) -> str:
         """The sentence that continues the run."""
-        words = shlex.join([str(self.run), *imports_of(self.run, to_train=True)])
+        words = shlex.join([str(self.run), *import_flags_of_run(self.run, to_train=True)])
         return f"continue with: bounce-mjx train {words}"
 
     @property
@@ -620,7 +629,7 @@ class Job:
         if not evaluated:
             return ""
         best = max(evaluated, key=lambda seed: seed.progress.best.score)
-        words = shlex.join([str(best.run), *imports_of(best.run)])
+        words = shlex.join([str(best.run), *import_flags_of_run(best.run)])
         return f" (its report so far: bounce-mjx report {words})"
 
     # Signals and faults
@@ -629,8 +638,8 @@ class Job:
         """The result of what is computed before the first block.
 
         Raises:
-          Interrupted: a stop was requested meanwhile; of several hosts in this process alone, whose
-            end then ends the others (`hosts.join`).
+          Interrupted: a stop was requested meanwhile. Several hosts do not agree on it here: this
+            process ends, and JAX then aborts the others (`hosts.join`).
         """
         if not self.stop.wait_for(future):
             raise Interrupted

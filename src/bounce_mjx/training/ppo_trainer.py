@@ -1,4 +1,5 @@
-"""The trainer in JAX: the compiled programs of `ppo.py`, on one or several devices.
+"""The trainer of PPO and its subclasses: the compiled programs of `learning/ppo.py`, on one or
+several devices.
 
 The program is the same on any number of devices: arrays over the environments are sharded along
 their batch axis, all other arrays are replicated, and XLA adds the reductions of gradients and
@@ -23,16 +24,9 @@ from bounce_mjx.learning.statistics import RunningStatistics
 from bounce_mjx.runs.config import TrainConfig
 from bounce_mjx.training import hosts
 from bounce_mjx.training.setup import compiler_options
-from bounce_mjx.training.trainer import BlockMetrics, Snapshot
+from bounce_mjx.training.trainer import BlockMetrics, Snapshot, each_seed
 
 _AXIS = "devices"
-
-
-def each_seed(tree: Any, num_seeds: int) -> list[Any]:
-    """The trees of S seeds from one whose arrays are [S, ...]; with one seed, the one tree."""
-    if num_seeds == 1:
-        return [tree]
-    return [jax.tree.map(lambda x, i=i: x[i], tree) for i in range(num_seeds)]
 
 
 class PPOTrainer:

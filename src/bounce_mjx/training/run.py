@@ -36,7 +36,7 @@ from bounce_mjx.reports.tables import (
 from bounce_mjx.resources import POLICIES, policy_path
 from bounce_mjx.runs import folders
 from bounce_mjx.runs.checkpoints import read_actor, read_record
-from bounce_mjx.runs.config import TrainConfig, imports_of, load_run_config
+from bounce_mjx.runs.config import TrainConfig, import_flags_of_run, load_run_config
 from bounce_mjx.runs.layers import FLAGS, PYTHON, Layers, layers_on
 from bounce_mjx.runs.progress import load_results
 from bounce_mjx.runs.start import FileFlags, StartFlags, find_start
@@ -106,7 +106,7 @@ class Run:
         return _read_policy(self.checkpoint)
 
     def env(self, world: str | Path | None = None, **settings: Any) -> Env:
-        """The environment of the policy's training.
+        """The environment of the policy, by default in the nominal world.
 
         Args:
           world: nominal (the default), training for the worlds that the training sampled, or a
@@ -307,23 +307,23 @@ def print_results(seeds: Sequence[job.SeedRun], console: Console) -> job.SeedRun
     """Prints the results of a training run; returns the best seed."""
     reports = {seed.config.seed: seed.progress.best for seed in seeds}
     evaluated = [seed for seed in seeds if seed.progress.best is not None]
-    best = max(evaluated, key=lambda seed: seed.progress.best.score)
-    report = best.progress.best
+    best_seed = max(evaluated, key=lambda seed: seed.progress.best.score)
+    # On fresh resets; the report that chose the checkpoint is of other ones.
+    report = best_seed.progress.best
     if len(seeds) > 1:
         print_table(console, seeds_table(reports))
     else:
-        title = f"best checkpoint, {best.progress.best_steps:,} steps, on fresh resets"
+        title = f"best checkpoint, {best_seed.progress.best_steps:,} steps, on fresh resets"
         print_table(console, results_table(report, title))
         say(console, details_line(report))
-        # The figures that chose it are of other resets.
-        say(console, f"chosen for {best.best.report.merit}")
+        say(console, f"chosen for {best_seed.best.report.merit}")
     if unsolved := unsolved_line(report, len(seeds)):
         say(console, unsolved)
-    spent = ", ".join(f"{name} {value:.1f} s" for name, value in best.seconds.items())
+    spent = ", ".join(f"{name} {value:.1f} s" for name, value in best_seed.seconds.items())
     say(console, f"time: {spent}")
-    label = "run" if len(seeds) == 1 else f"best seed: {best.config.seed}  run"
-    say(console, f"{label}: {best.run}")
-    return best
+    label = "run" if len(seeds) == 1 else f"best seed: {best_seed.config.seed}  run"
+    say(console, f"{label}: {best_seed.run}")
+    return best_seed
 
 
 def leave_report(seed: job.SeedRun, console: Console) -> None:
@@ -333,7 +333,7 @@ def leave_report(seed: job.SeedRun, console: Console) -> None:
       TrainingStopped: a signal came meanwhile.
     """
     started = time.perf_counter()
-    words = shlex.join([str(seed.run), *imports_of(seed.run)])
+    words = shlex.join([str(seed.run), *import_flags_of_run(seed.run)])
     again = f"draw it with: bounce-mjx report {words}"
     try:
         # Imported during the compilation (`Job.compile`).

@@ -38,7 +38,8 @@ class Outcome:
     """What a save has written."""
 
     numbers: dict[str, int]
-    """Those of the checkpoints, by the name of the run's folder."""
+    """Those of the checkpoints, by the name of the folder of the run or the seed, which with one
+    seed are the same."""
     problem: str | None = None
     """Why something could not be written; None if everything was."""
 
@@ -72,7 +73,7 @@ class Saver:
 
     def recall(self, numbers: Iterable[int]) -> None:
         """Takes over the checkpoints of a resumed run that count, by number: those that were
-        trained before the one from which it resumes, and this one."""
+        trained before the one from which it resumes, and this one. The next save removes others."""
         self._written = sorted(numbers)
 
     def start(self, snapshot: Snapshot | None, steps: int, about: dict[str, Any]) -> None:
@@ -100,7 +101,8 @@ class Saver:
             concurrent.futures.wait([self._saving])
 
     def collect(self, is_last: bool = False) -> str | None:
-        """Waits for the save that was started last, and tells the seeds what it has written.
+        """Waits for the save that was started last, and tells the seeds what it has written. On
+        several hosts, every process must call this at the same point (`hosts.exchange`).
 
         Args:
           is_last: whether no other save follows, so that a problem is the caller's to tell.

@@ -37,7 +37,8 @@ class SeedRun:
     report: Report | None = None
     """The evaluation of the current policy; None before it."""
     best: Best | None = None
-    """The best policy so far; `progress.best` is its report."""
+    """The best policy so far. `progress.best` is its report, until that of the final evaluation, on
+    fresh resets, takes its place."""
     saved_best: Best | None = None
     """The best policy of those that were saved."""
     saved_progress: Progress = dataclasses.field(default_factory=Progress)
@@ -65,9 +66,10 @@ class SeedRun:
         an evaluation, which might end the training.
 
         Args:
-          number: that of the seed's checkpoint, if one was written.
-          is_saved: whether the evaluations so far are in a checkpoint that was written.
-          has_failed: whether something could not be written.
+          number: that of the checkpoint in the seed's own folder, if one was written.
+          is_saved: whether the evaluations so far are in a checkpoint that was written: this one,
+            or of several seeds the one of their states.
+          has_failed: whether something could not be written; of several, the rest may be.
         """
         if number is not None and self.has_unsaved_best:
             self.best = dataclasses.replace(self.best, number=number)

@@ -4,6 +4,7 @@ import concurrent.futures
 from collections.abc import Sequence
 from typing import Any, NamedTuple, Protocol
 
+import jax
 import numpy as np
 from jax.sharding import Mesh
 
@@ -32,7 +33,8 @@ class Trainer(Protocol):
 
     The job asks the algorithm for one (`learning.algorithm.Algorithm.make_trainer`). Then it calls
     `compile` and `start`, once each, and `train_block` for each block. It may ask for
-    `state_template` at any time, and after `start` for a `snapshot`. `PPOTrainer` is one.
+    `state_template` at any time, and after `start` for a `snapshot`. `PPOTrainer` is one. The job
+    calls `compile` and `train_block` in another thread than the rest, one call after another.
     """
 
     checked: Sequence[str]
@@ -65,8 +67,17 @@ class Trainer(Protocol):
           Metrics, each [S, I]. The job needs three: "fault", the number, from 1, of the first
           quantity of `checked` that was not finite in an iteration, and 0 if all were finite;
           "episode/ended", how many episodes ended; "task/non_finite", how many of them because the
-          physics was not finite. "episode/return" is said after each block where it is there.
+          physics was not finite. Others are for the log, and used where they are there:
+          "episode/return" is said after each block; of the first block, each "reward/..." and
+          "task/too_fast" tell settings in a wrong unit (`faults.why_unlearnable`).
         """
 
     def snapshot(self) -> Snapshot:
         """The policies and the whole state, in every process."""
+
+
+def each_seed(tree: Any, num_seeds: int) -> list[Any]:
+    """The trees of S seeds from one whose arrays are [S, ...]; with one seed, the one tree."""
+    if num_seeds == 1:
+        return [tree]
+    return [jax.tree.map(lambda x, i=i: x[i], tree) for i in range(num_seeds)]
