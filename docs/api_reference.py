@@ -161,10 +161,11 @@ def _source(documented: griffe.Object) -> str:
 
 
 def _summary(documented: griffe.Object) -> str:
-    """The first sentence of the docstring, in a cell of a table."""
+    """The docstring's first sentence up to a semicolon, in a cell of a table."""
     paragraph, *_ = documented.docstring.value.split("\n\n")
-    sentence, end, _ = (" ".join(paragraph.split()) + " ").partition(". ")
-    return f"{sentence}{end.strip()}".strip().replace("|", "\\|")
+    sentence, *_ = f"{' '.join(paragraph.split())} ".split(". ")
+    clause, *_ = sentence.split("; ")
+    return f"{clause.strip().removesuffix('.')}.".replace("|", "\\|")
 
 
 def _class(documented: griffe.Class) -> Iterator[str]:

@@ -172,7 +172,7 @@ def root_mean_square(
 
 
 def mean_and_margin(totals: np.ndarray, events: np.ndarray) -> tuple[float | None, float]:
-    """The mean over all steps or events of E episodes, None without any; and its margin.
+    """The mean over all steps or events of E episodes, and its margin; None without any.
 
     The steps of one episode are alike, so the margin comes from the spread between episodes: the
     standard error of a ratio estimator (W. G. Cochran, Sampling Techniques, 1977, section 2.11).

@@ -46,7 +46,7 @@ class StepResult(NamedTuple):
 
 
 class TorchVectorEnv:
-    """B environments; an ended episode is reset within the step that ends it."""
+    """B environments in PyTorch; an ended episode is reset within the step that ends it."""
 
     def __init__(
         self,
