@@ -7,7 +7,7 @@ times that jitter.
 Each policy plays as in a rehearsal, in sessions of 20 s, until its episodes have the asked time
 together, or three times as much was simulated: a ball that is lost is fetched, and the arm sent
 home. A stop is true where the ball was lost, where the simulation had two balls touch in the 0.4 s
-before, and where one had stopped to bounce: it hopped less than 5 cm for 0.4 s, or less than 12 cm
+before, and where one had stopped to bounce: it hopped less than 5 cm for 0.4 s, or less than 15 cm
 for the 2 s in which a ball has to leave the paddle; else it is a false alarm. The arm has no other
 errors than those given here and a little noise of its encoders. A policy whose arm's package is
 missing is named and left out.
@@ -41,9 +41,9 @@ LOOKED_AT = 0.4
 """Time before a stop in which balls touched, s."""
 TOUCHING = 0.041
 """Distance of two balls' centres at which they touch, m."""
-HOPPING = ((0.4, 0.0725), (2.0, 0.1425))
+HOPPING = ((0.4, 0.0725), (2.0, 0.1725))
 """A ball that stayed below a height above the paddle's centre (m) for a time (s) bounces no more:
-it lies 2.25 cm above it, and hops 5 or 12 cm."""
+it lies 2.25 cm above it, and hops 5 or 15 cm."""
 WORLD = {
     "ball_latency": 0.01,
     "ball_velocity_noise": 0.1,
