@@ -210,6 +210,8 @@ FAULTS = [
      "bool(truncated[i] and not terminated[i])", "bool(terminated[i])", "test_sb3.py -k single_environments"),
     ("an episode takes the seed of the one before", "adapters/gymnasium/environments.py",
      "self._is_drawn[mask] = False", "self._is_drawn[mask] = True", "test_gymnasium.py -k vector_equals"),
+    ("pictures of the hand that throws a ball are of its flight", "deploy/samples.py",
+     "if not seen.paddle or taken < seen.let_go:", "if not seen.paddle:", "test_motion.py -k thrown_from_a_hand"),
     ("an episode's return is its last reward", "adapters/gymnasium/environments.py",
      "self._returns += reward", "self._returns = np.array(reward, float)", "test_gymnasium.py -k vector_equals"),
     ("every end is a time-out for rsl_rl", "adapters/torch/rsl_rl_env.py",

@@ -13,9 +13,8 @@ import pytest
 import bounce_mjx
 from bounce_mjx.commands import eval as eval_command
 from bounce_mjx.commands.main import main as console_script
-from bounce_mjx.commands.play import PlayCommand
+from bounce_mjx.commands.play import PlayCommand, film_command
 from bounce_mjx.commands.train import fields_of_command
-from bounce_mjx.commands.which_policy import film_command
 from bounce_mjx.config.command_line import all_flags, parse
 from bounce_mjx.resources import resource_path
 from bounce_mjx.runs.config import TrainConfig
@@ -357,7 +356,7 @@ def test_eval_reports_five_results(trained: Path, tmp_path: Path, capsys) -> Non
     ],
 )
 def test_the_command_of_a_film_has_no_flag_that_play_lacks(line: str) -> None:
-    shown = film_command(line.split(), eval_command._NOT_OF_PLAY, "--episode", "3")
+    shown = film_command(line.split(), eval_command.EvalCommand, "--episode", "3")
     assert shown == "bounce-mjx play RUN --nominal --episode 3"
     parse(PlayCommand, shown.split()[2:], prog="bounce-mjx play")
 

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Annotated
 from rich.console import Console
 
 from bounce_mjx.commands.goals import parse_with_goals
+from bounce_mjx.commands.play import film_command
 from bounce_mjx.commands.which_policy import (
     MirrorRobot,
     OnePolicy,
     OtherRandomization,
     OtherWorld,
     WhichPolicy,
-    film_command,
     world_of_flags,
 )
 from bounce_mjx.config.command_line import Flag, stdout
@@ -28,9 +28,6 @@ from bounce_mjx.world.randomization import RandomizationConfig
 if TYPE_CHECKING:
     from bounce_mjx.evaluation.failures import Failure
     from bounce_mjx.evaluation.statistics import Statistics
-
-# Flags that `play` lacks, which the command of a film leaves out; one that ends with = has a value.
-_NOT_OF_PLAY = ("--failures", "--contacts", "--limits", "--json=", "--physics=")
 
 
 class EvalCommand(WhichPolicy):
@@ -159,7 +156,7 @@ def main(args: Sequence[str]) -> None:
             first_to_end = min(failures, key=lambda failure: failure.seconds)
             film = "--episode", str(first_to_end.episode)
             imports = import_flags_of_classes(config.env.task)
-            print(f"film of one: {film_command(args, _NOT_OF_PLAY, *film, imports=imports)}")
+            print(f"film of one: {film_command(args, EvalCommand, *film, imports=imports)}")
     elif command.failures:
         print(f"no episode of {command.episodes:,} failed")
     sys.exit(0 if report.passed else 1)

@@ -1,5 +1,6 @@
 """Shows a trained policy: `bounce-mjx play [CHECKPOINT ...]`."""
 
+import shlex
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -14,8 +15,15 @@ from bounce_mjx.commands.which_policy import (
     suite_conditions,
     world_of_flags,
 )
-from bounce_mjx.config.command_line import Flag, stdout
-from bounce_mjx.config.settings import Count, NonNegativeInt
+from bounce_mjx.config.command_line import (
+    Flag,
+    all_flags,
+    flag_names,
+    negated,
+    plain_words,
+    stdout,
+)
+from bounce_mjx.config.settings import Count, NonNegativeInt, fields_in
 from bounce_mjx.errors import UserError, suggest
 from bounce_mjx.evaluation.config import (
     DEFAULT_CONDITION_EPISODES,
@@ -105,6 +113,42 @@ def main(args: Sequence[str]) -> None:
             film = film_player(find, actor, policy, _evaluation_seed(command))
         shown.append(Shown(config.env, partial(_controller, actor), title, policy, film))
     show(shown, command.viewing, goals=goals, console=stdout())
+
+
+def film_command(
+    args: Sequence[str],
+    command_class: type[WhichPolicy],
+    *film: str,
+    imports: Sequence[str] = (),
+) -> str:
+    """The command that shows an episode of the evaluation that a command line started: its words,
+    without the flags that `play` lacks.
+
+    Args:
+      args: the words of the command line.
+      command_class: what they were read into; each of those flags has one value, or is a switch.
+      film: the flags of the episode.
+      imports: those of the user's own task.
+    """
+    known = all_flags(fields_in(PlayCommand))
+    fields = fields_in(command_class)
+    switches: set[str] = set()
+    with_value: set[str] = set()
+    for key, flag in flag_names(fields).items():
+        if flag not in known:
+            is_switch = fields[key].annotation is bool
+            (switches if is_switch else with_value).add(flag)
+    switches |= {negated(flag) for flag in switches}
+    kept = []
+    words = iter(plain_words(args))
+    for word in words:
+        flag, equals, _ = word.partition("=")
+        if flag in with_value and not equals:
+            # Its value.
+            next(words, None)
+        elif flag not in switches | with_value:
+            kept.append(word)
+    return shlex.join(["bounce-mjx", "play", *kept, *film, *imports])
 
 
 def _controller(make_actor: "Callable[[Env], Actor]", env: "Env") -> "Controller":

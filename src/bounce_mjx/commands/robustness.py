@@ -7,20 +7,17 @@ from typing import Annotated
 
 from rich.progress import Progress
 
+from bounce_mjx.commands.play import film_command
 from bounce_mjx.commands.which_policy import (
     MirrorRobot,
     OnePolicy,
     WhichPolicy,
-    film_command,
     suite_conditions,
 )
 from bounce_mjx.config.command_line import Flag, parse, stdout
 from bounce_mjx.config.settings import Count, NonNegativeInt
 from bounce_mjx.config.user_code import import_flags_of_classes
 from bounce_mjx.evaluation import config as evaluation
-
-# Flags that `play` lacks, which the command of a film leaves out; one that ends with = has a value.
-_NOT_OF_PLAY = ("--assumed", "--out=", "--physics=")
 
 
 class RobustnessCommand(WhichPolicy):
@@ -107,6 +104,6 @@ def main(args: Sequence[str]) -> None:
         worst = min(lost, key=lambda outcome: outcome.lasted)
         film = "--condition", worst.label, "--episode", str(worst.lost[0])
         imports = import_flags_of_classes(config.env.task)
-        shown = film_command(args, _NOT_OF_PLAY, *film, imports=imports)
+        shown = film_command(args, RobustnessCommand, *film, imports=imports)
         print(f"film of one that ended: {shown}")
     sys.exit(0 if report.passed else 1)

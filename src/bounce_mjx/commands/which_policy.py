@@ -1,14 +1,12 @@
 """Which policy a command is about, and the flags that several commands share."""
 
 import os
-import shlex
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from pydantic import Field
 
-from bounce_mjx.config.command_line import Flag, plain_words
+from bounce_mjx.config.command_line import Flag
 from bounce_mjx.config.settings import StrictModel
 from bounce_mjx.errors import UserError, suggest
 from bounce_mjx.resources import policy_folder
@@ -103,29 +101,6 @@ def suite_conditions(
     _, named = read_named_world(world)
     assumed = named.double_assumed(model_nominals(there))
     return path, load_suite(path, config.env, there, assumed), len(assumed)
-
-
-def film_command(
-    args: Sequence[str], omitted: Sequence[str], *film: str, imports: Sequence[str] = ()
-) -> str:
-    """The command that shows an episode of the evaluation that a command line started.
-
-    Args:
-      args: the words of the command line.
-      omitted: its flags that `play` lacks; a name that ends with = has a value.
-      film: the flags of the episode.
-      imports: those of the user's own task.
-    """
-    without_value = {flag for flag in omitted if not flag.endswith("=")}
-    without_value |= {flag.replace("--", "--no-", 1) for flag in without_value}
-    kept = []
-    words = iter(plain_words(args))
-    for word in words:
-        if f"{word}=" in omitted:
-            next(words, None)
-        elif word not in without_value and f"{word.partition('=')[0]}=" not in omitted:
-            kept.append(word)
-    return shlex.join(["bounce-mjx", "play", *kept, *film, *imports])
 
 
 class WhichPolicy(StrictModel):

@@ -212,7 +212,7 @@ def _plain_word(word: str) -> str:
     if value.lower() == "true":
         return flag
     if value.lower() == "false":
-        return _negated(flag)
+        return negated(flag)
     return f"{flag}{equals}{value}"
 
 
@@ -266,12 +266,13 @@ def flag_names(fields: Mapping[str, FieldInfo]) -> dict[str, str]:
         flag = whole if short in taken else short
         taken.add(flag)
         if fields[key].annotation is bool:
-            taken.add(_negated(flag))
+            taken.add(negated(flag))
         flags[key] = flag
     return flags
 
 
-def _negated(flag: str) -> str:
+def negated(flag: str) -> str:
+    """The flag that switches off what a flag switches on."""
     return flag.replace("--", "--no-", 1)
 
 
@@ -370,7 +371,7 @@ def all_flags(fields: Mapping[str, FieldInfo]) -> list[str]:
         if not _mark(fields[key]).is_positional:
             flags.append(flag)
             if fields[key].annotation is bool:
-                flags.append(_negated(flag))
+                flags.append(negated(flag))
     return flags
 
 
