@@ -27,6 +27,7 @@ from bounce_mjx.evaluation.results import Report, Result
 from bounce_mjx.interrupt import Interrupted
 from bounce_mjx.learning.config import PPOConfig
 from bounce_mjx.learning.ppo import PPO
+from bounce_mjx.learning.registry import find_algorithm
 from bounce_mjx.runs import checkpoints
 from bounce_mjx.runs.checkpoints import policy_shapes, read_networks, read_policy, read_record
 from bounce_mjx.runs.config import TrainConfig, import_flags_of_run, load_run_config
@@ -296,6 +297,11 @@ def test_an_algorithm_brings_its_own_trainer(tmp_path: Path, monkeypatch) -> Non
     config = read_layers(Choice(algorithm="without")).config(said)
     with pytest.raises(UserError, match="the algorithm Without has no make_trainer"):
         _run_of(config, None, (), io.StringIO(), scores)
+    # Not the trainer of PPO.
+    forgets = classmethod(lambda cls, config, env: None)
+    monkeypatch.setattr(find_algorithm("without"), "make_trainer", forgets)
+    with pytest.raises(UserError, match="make_trainer of the algorithm Without has returned None"):
+        _run_of(config, None, (), io.StringIO(), scores)
 
 
 def test_a_history_of_checkpoints_stays_where_it_is_asked_for(tmp_path: Path) -> None:
@@ -435,6 +441,9 @@ def test_a_training_stops_once_its_results_have_a_margin(tmp_path: Path) -> None
     assert "the training ends after its 256 steps (total_steps)" in shown.getvalue()
     train(tmp_path, RETURNS, run, margins=margins, said=(shown := io.StringIO()))
     assert f"{run} has been trained to its end, 256 steps;" in shown.getvalue()
+    # What `stop_when_solved` did not end, no steps go beyond.
+    going_on = read_layers(Choice(word=str(run))).config({"total_steps": 10**6})
+    assert going_on.sources["stop_when_solved"] != BEYOND_RESULTS
 
 
 def test_settings_that_cannot_be_trained_are_refused_before_a_save(tmp_path: Path) -> None:
@@ -582,6 +591,19 @@ def test_a_signal_during_the_last_save_is_not_lost(tmp_path: Path, monkeypatch) 
         train(tmp_path, {1: 5.0, 2: 9.0})
     (run,) = tmp_path.iterdir()
     assert results_of(run)["fresh_resets"]
+
+
+def test_a_signal_while_the_callbacks_are_closed_is_not_lost(tmp_path: Path) -> None:
+    class Closing:
+        def __call__(self, event) -> None:
+            pass
+
+        def close(self) -> None:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    ended = "after 64 steps, at the end of the training; the results are in"
+    with pytest.raises(job.TrainingStopped, match=ended):
+        train(tmp_path, {1: 5.0}, callbacks=[Closing()])
 
 
 def test_a_signal_during_the_compilation_leaves_nothing(tmp_path: Path) -> None:

@@ -168,7 +168,7 @@ def of_run(config: TrainConfig) -> tuple:
     with contextlib.ExitStack() as stack, pytest.MonkeyPatch.context() as patch:
         job = open_job(config, Console(quiet=True), stack)
         # As if all results were met: then `stop_when_solved` ends it before the first block.
-        patch.setattr("bounce_mjx.training.job.waits_are_over", lambda seeds: True)
+        patch.setattr("bounce_mjx.training.job.all_may_end", lambda seeds: True)
         while not job.ends_here():
             blocks.append(job.steps)
             job.steps += job.steps_per_block

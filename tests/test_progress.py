@@ -38,7 +38,7 @@ def test_a_training_does_not_wait_long_for_a_margin(evaluations, solved: bool) -
     for steps, margin in evaluations:
         result = Result("stable", "episodes, %", 0.0, ">= 99", margin is not None, margin)
         progress.add(Report((result,), {"mean_return": 1.0}), steps, 0.0)
-    assert progress.wait_is_over is solved
+    assert progress.may_end is solved
 
 
 def test_of_equal_evaluations_the_newest_is_the_best() -> None:

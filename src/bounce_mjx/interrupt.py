@@ -47,7 +47,7 @@ def _handle(number: int, handler: Any) -> Any:
 
 class StopRequest:
     """While entered in the main thread, the first signal only sets `requested`. A SIGINT or SIGTERM
-    more than `_SAME_REQUEST_SECONDS` later does what it did before: by the default action, which
+    more than `_SAME_REQUEST_SECONDS` later does what it did before: as by the default action, which
     commands have (`end_on_ctrl_c`), it ends the process at once; a Python handler is called, of
     which Python's own, also that of a notebook, raises a KeyboardInterrupt, and the process ends
     where one returns. Any other signal after the first does nothing."""

@@ -90,6 +90,7 @@ def main(args: Sequence[str]) -> None:
     console = stdout()
     world = world_of_flags(command.world, command.randomization)
     (checkpoint,) = command.choose(command.checkpoint, robot=command.robot)
+    # `evaluate_policy` changes it once more, by `options`: the engine, the goals and --nominal.
     config = command.config_of(checkpoint, command.robot, world)
     if command.limits and config.env.robot.limits.velocity is None:
         raise UserError("the policy's arm has no command limits (env.robot.limits); omit --limits")

@@ -1,7 +1,7 @@
 """Trains a policy in JAX and writes a run's folder (`bounce-mjx train`).
 
-The words are read once (`read_command`): what the training begins with, the flags, and the values
-that are said. `TrainCommand.settings` puts these on a machine's preset and the user's files.
+The words are read in one place (`read_command`): what the training begins with, the flags, and the
+values that are said. `TrainCommand.settings` puts these on a machine's preset and the user's files.
 """
 
 import shlex
@@ -33,7 +33,8 @@ _SHORT_HELP = (
 
 
 class TrainFlags(Choice):
-    """The flags that decide which layers there are, and those beside the keys of the config."""
+    """The flags that are no keys of the config, beside those of `Choice`, which decide what layers
+    there are. Each key of the config has a flag, too (`fields_of_command`)."""
 
     print_config: bool = False
     """Print the config, with the layer that sets each value, and train nothing."""

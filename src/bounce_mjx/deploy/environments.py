@@ -1,6 +1,7 @@
 """An environment for a user of Python: of a task, of a policy or of a run, in a world
-(`settings_in_world`), with settings on top. Every adapter takes the `Env` that `environment` gives;
-a command makes its own of the config that `WhichPolicy.config_of` gives.
+(`settings_in_world`), with settings on top. Every adapter takes the `Env` that `environment` gives.
+A command makes its own: `eval`, `play` and `robustness` of the config that `WhichPolicy.config_of`
+gives, `rehearse` of `environment_config`, `export` and `report` of the run's, as trained.
 
 It is among the exported policies because an .onnx file is a policy with its environment, too.
 """

@@ -13,8 +13,8 @@ import numpy as np
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError
 
-# By the package that defines them. Another class is refused, since the next release of a library,
-# or a user, may write any; but not one that extends these and has the same acting (`_ACTING`).
+# By the package that defines them. Only these are known, and classes that extend them without
+# another acting (`_ACTING`): the next release of a library, or a user, may write any other.
 _CHANGE_NOTHING = {
     "gymnasium": {
         "Wrapper",
@@ -95,7 +95,7 @@ def environments_in(env: Any) -> list[Env]:
     return environments
 
 
-def in_library(act: Callable[[jax.Array], jax.Array], size: int) -> Callable[[Any], Any]:
+def for_any_arrays(act: Callable[[jax.Array], jax.Array], size: int) -> Callable[[Any], Any]:
     """A policy for the arrays of any library.
 
     Args:
@@ -179,13 +179,13 @@ def _changes_nothing(env: Any) -> bool:
     for kind in type(env).__mro__:
         package = kind.__module__.partition(".")[0]
         if package == "bounce_mjx" or kind.__name__ in _CHANGE_NOTHING.get(package, ()):
-            return kind.__name__ != "DtypeObservation" or _has_numbers_of_a_policy(env)
+            return kind.__name__ != "DtypeObservation" or _keeps_float32(env)
         if any(name in vars(kind) for name in _ACTING):
             return False
     return False
 
 
-def _has_numbers_of_a_policy(env: Any) -> bool:
+def _keeps_float32(env: Any) -> bool:
     """Whether a DtypeObservation keeps float32's precision."""
     dtype = np.dtype(env.observation_space.dtype)
     return dtype.kind == "f" and dtype.itemsize >= 4

@@ -22,8 +22,8 @@ class Algorithm:
 
     @classmethod
     def make_trainer(cls, config: Any, env: Any) -> Any:
-        """What trains: a `training.trainer.Trainer`, whose docstring says what the job calls; None
-        for the trainer of `PPO`, which `job.make_trainer` takes then.
+        """What trains: a `training.trainer.Trainer`, whose docstring says what the job calls. Of
+        `PPO` and its subclasses alone it is None: `job.trainer_of` then makes a `PPOTrainer`.
 
         Args:
           config: of the run, a `runs.config.TrainConfig`; its `ppo` is of this class's `Config`.

@@ -106,7 +106,7 @@ class TrainConfig(StrictModel):
     best. 0 for all at once."""
     eval_seed: EvalSeed = 10_000
     """Seed of the evaluations during training; not that of `bounce-mjx eval`."""
-    # The margin is `Report.passed_with_margin`, the end `Progress.wait_is_over`.
+    # The end is `Progress.may_end`; how far inside each bound a margin is, `task/results.py` says.
     stop_when_solved: bool = False
     """End once an evaluation meets all results with a margin, so clearly that 64 other episodes
     should meet them too (they are not run). Where no margin comes, end with the evaluation after

@@ -13,7 +13,7 @@ a run's folder, or of a seed's, which looks like one (`training.run.Run` reads i
         checkpoints/<number>/           the newest states, as many as keep_checkpoints says, and
                                         the best evaluation
             policy/                     the policy's arrays
-            training/                   the training state's arrays; only what a run resumes from
+            training/                   the training state's arrays; only where a run can resume
             networks/                   both networks, for another training; not of every algorithm
             record/                     the steps, the config, the evaluations so far and its own
             manifest.json               size and SHA-256 of every other file
@@ -157,7 +157,7 @@ def find_checkpoint(path: str | Path) -> Checkpoint:
         with that name.
 
     Raises:
-      UserError: there is none, or it is none of a policy but that of a run's several seeds.
+      UserError: there is none, or it holds the state of several seeds, and no policy.
     """
     place = policy_path(path)
     run = run_of(place)

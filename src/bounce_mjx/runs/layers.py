@@ -5,13 +5,13 @@ algorithm and which policy or run a training begins with. Everything else is val
 (`Layer`), in the order of `Rank`, and a later one wins. Those of the environment alone, of a
 policy, a robot and a world, are in `worlds.py`.
 
-`layers_on` reads the layers below the user's, each file once. `Layers.config` puts the user's on
-top, merges all of them and validates the result, once; the config then knows what set each of its
-values (`TrainConfig.sources`).
+`layers_on` reads the layers below what is said as values, each file once. `Layers.config` puts the
+user's on top, merges all of them and validates the result, once; the config then knows what set
+each of its values (`TrainConfig.sources`).
 
-A resumed run has two layers: its own config, and what the user says; more steps switch its
-`stop_when_solved` off where that had ended it (`Layers._beyond_results`). A whole config, of
-Python, has no presets below it.
+A resumed run has two layers: its own config, and what the user says; any `total_steps` that is said
+switches its `stop_when_solved` off where that had ended it (`Layers._beyond_results`). A whole
+config, of Python, has no presets below it.
 """
 
 import dataclasses
@@ -47,8 +47,9 @@ from bounce_mjx.world.named import without_idle_curriculum
 
 class Rank(enum.StrEnum):
     """The kinds of layers of a new training, the lowest first: a layer wins over those of a lower
-    rank. Each is in the words of docs/config.md. A robot's file may say something of the training,
-    too. A warm start brings its own robot, beside which there is no other."""
+    rank. The first and the last are not among `Layers.below`. Each is in the words of
+    docs/config.md. A robot's file may say something of the training, too. A warm start brings its
+    own robot, beside which only a world may name one, the same (`layers_of_environment`)."""
 
     DEFAULTS = "the defaults of the task and of the algorithm"
     """No layer: what the types of the settings say."""
@@ -60,14 +61,14 @@ class Rank(enum.StrEnum):
     ROBOT = "a robot: `--robot`, or that of `--world`"
     WORLD = "a world: `--world`"
     USER = "what you say: flags, or arguments of `train`"
-    """Not among `Layers.below`."""
+    """`Layers.config` adds it."""
 
 
 FLAGS = "flags"
 """Source of the settings on a command line."""
 PYTHON = "train()"
 """Source of the arguments of `train` in Python."""
-BEYOND_RESULTS = "more steps, after the results had ended the run"
+BEYOND_RESULTS = "total_steps, said after the results had ended the run"
 """Source of a `stop_when_solved` that is switched off (`Layers._beyond_results`)."""
 
 
@@ -128,9 +129,9 @@ def layers_on(start: Start, files: FileFlags, machine: Path | None = None) -> "L
 
 
 def _check_start(layer: Layer, start: Start) -> None:
-    """Checks that a file, which has values alone, is of what the training begins with: no file says
-    the task. An algorithm or a warm start that the user names wins over the file's, as any flag
-    does.
+    """Checks that a file, which has values alone, is of what the training begins with: no file
+    chooses the task, and one that names it must name this one. An algorithm or a warm start that
+    the user names wins over the file's, as any flag does.
 
     Raises:
       UserError: it is of another task, or of an algorithm or a warm start that the user does not
@@ -317,18 +318,19 @@ class Layers:
         return key
 
     def _beyond_results(self, user: Layer) -> list[Layer]:
-        """A layer for a resumed run that its results have ended (`waits_are_over`), where a number
-        of steps is asked for: it goes on to that number."""
-        if self.start.resumed_config is None or "total_steps" not in user.values:
+        """A layer for a resumed run that its results have ended (`all_may_end`), where a number of
+        steps is said: it goes on to that number."""
+        resumed = self.start.resumed_config
+        if resumed is None or not resumed.stop_when_solved or "total_steps" not in user.values:
             return []
         from bounce_mjx.runs.folders import latest_checkpoint, run_of
-        from bounce_mjx.runs.progress import Progress, waits_are_over
+        from bounce_mjx.runs.progress import Progress, all_may_end
         from bounce_mjx.runs.records import verify
 
         checkpoint = latest_checkpoint(run_of(self.start.place), self.start.place)
         progress = verify(checkpoint).progress
         seeds = [Progress.model_validate(seed) for seed in progress.get("seeds", [progress])]
-        if waits_are_over(seeds):
+        if all_may_end(seeds):
             return [Layer(BEYOND_RESULTS, {"stop_when_solved": False})]
         return []
 
@@ -374,8 +376,8 @@ def _merge(layers: Sequence[Layer]) -> tuple[dict[str, Any], dict[str, str]]:
             values["env"] = values["env"] | {"randomization": randomization}
         its_keys = flat(layer.values)
         kept = {key: source for key, source in sources.items() if key not in its_keys}
-        # The newest keys come last: `TrainConfig.sources` gives a mapping such as `shares`, whose
-        # entries may have several sources, the last of these.
+        # The newest keys come last. A mapping such as `shares` may have entries of several sources,
+        # and `TrainConfig.sources` gives the last one for it.
         sources = kept | dict.fromkeys(its_keys, layer.source)
     # A later layer may end a value, or replace a mapping by None.
     remaining = flat(values)

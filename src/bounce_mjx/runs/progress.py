@@ -28,13 +28,13 @@ class Progress(pydantic.BaseModel):
     solved_steps: int | None = None
     """Steps at the first evaluation that met all results, with a margin or without: the end of the
     time "to all five results" (of bounce) in every measurement. `stop_when_solved` ends the
-    training later, see `wait_is_over`."""
+    training later, see `may_end`."""
     solved_seconds: float | None = None
     """Seconds from the setup of this training, or of its last resumption, to the end of that
     evaluation."""
     margin_steps: int | None = None
     """Steps at the first evaluation that met all with a margin
-    (`Report.passed_with_margin`; its size is in `task/results.py`)."""
+    (`Report.passed_with_margin`): as far inside each bound as `task/results.py` asks."""
     evaluations: list[dict[str, Any]] = []
     """Of each, the value of each result by its name, its `steps`, whether a full evaluation
     `passed`, and whether it ended with the `screening`, as the policy could not be the best."""
@@ -44,9 +44,9 @@ class Progress(pydantic.BaseModel):
         return self.model_copy(update={"evaluations": list(self.evaluations)})
 
     @property
-    def wait_is_over(self) -> bool:
-        """Whether a margin has come, also to the policy of a warm start at step 0, or the wait for
-        it is over."""
+    def may_end(self) -> bool:
+        """Whether `stop_when_solved` ends the training: a margin has come, also to the policy of a
+        warm start at step 0, or the wait for it has been `PATIENCE` long."""
         if self.margin_steps is not None:
             return True
         # The wait is counted from a trained policy: from step 0 it would be over at once.
@@ -93,10 +93,10 @@ class Progress(pydantic.BaseModel):
         return True
 
 
-def waits_are_over(seeds: Sequence[Progress]) -> bool:
-    """Whether `stop_when_solved` ends the training of these seeds: of each, a margin has come,
-    or the wait for it is over. Those that have diverged do not count."""
-    return all(seed.wait_is_over for seed in seeds if seed.fault is None)
+def all_may_end(seeds: Sequence[Progress]) -> bool:
+    """Whether `stop_when_solved` ends the training of these seeds (`Progress.may_end`). Those that
+    have diverged do not count."""
+    return all(seed.may_end for seed in seeds if seed.fault is None)
 
 
 class Results(Progress):

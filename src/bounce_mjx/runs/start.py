@@ -29,8 +29,8 @@ from bounce_mjx.task.task import Task
 
 class StartFlags(StrictModel):
     """The flags that decide, with the first word, what a training begins with. They are keys of the
-    config, too: the algorithm's class, the policy of a warm start, and where latest is looked
-    for."""
+    config, too: the algorithm's class, the policy of a warm start, and the folder in which a new
+    run is made and latest is looked for."""
 
     algorithm: str | None = None
     warm_start: Path | None = None
@@ -113,6 +113,7 @@ def find_start(word: str | None, flags: StartFlags, whole: TrainConfig | None = 
     """
     if word is None or is_task(word):
         return _new_start(word, flags.warm_start, flags, whole)
+    # None where a folder of the user's has the name.
     if policy_folder(word):
         if flags.warm_start is not None:
             raise UserError(

@@ -1,13 +1,14 @@
 """The settings of the environment of a task, or of a policy's training, in a world:
-`settings_in_world`. `deploy.environments.environment` makes the `Env`. What acts with a policy
-where it was trained, such as `export`, takes the settings of its run as they are
+`settings_in_world`. It is called by `deploy.environments`, which makes the `Env` of Python and of
+the adapters, and by `WhichPolicy.config_of`, for `eval`, `play` and `robustness`. What acts with a
+policy where it was trained, such as `export`, takes the settings of its run as they are
 (`load_run_config`).
 
 They are layers (`Layer`), the lowest first: what the policy was trained in, its robot, and
 its world (`layers_of_environment`). A training has further layers between them (`runs/layers.py`).
 
 A world (`World`) is a part of these settings (`WorldConfig`): the randomisation, and what else a
-named world's file sets, such as the delays of a controller.
+named world's file sets of `WorldSettings`, such as friction.
 """
 
 import os

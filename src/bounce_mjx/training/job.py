@@ -2,17 +2,24 @@
 
 It is the same for every algorithm whose trainer is a `Trainer`.
 
-A training stops or ends. It stops (`must_stop`) by a signal, or by an exception in a callback: what
-is new is saved, and the run can be resumed. It ends (`ends_here`) by its steps, by a callback that
-returns False, or by its results: then the best policy is evaluated, too.
+A training stops, ends or fails. It stops (`must_stop`) by a signal, or by an exception in a
+callback: what is new is saved, and the run can be resumed. It ends (`ends_here`) by its steps, by a
+callback that returns False, or by its results: then the best policy is evaluated, too. It fails
+with an error, such as where every seed has diverged (`mark_diverged`).
 
-From a signal to its checkpoint: `StopRequest` notes the signal, the block goes on to its end
-(`train_block`), an evaluation that is due is left out (on several hosts it is done, as a process
-that stopped alone would keep the others waiting), `must_stop` ends the loop, and `finish` saves
-the state, waits until it is written, and raises `TrainingStopped` with the command that resumes
-the run, also where the signal came as late as the last save. A later Ctrl-C or SIGTERM does what it
-did before the training: in a command, it ends the process at once (`StopRequest`). What was saved
-before it stays.
+From the first signal to its checkpoint:
+
+1. `StopRequest` notes the signal.
+2. The block goes on to its end (`train_block`).
+3. An evaluation that is due is left out. On several hosts it is done, as a process that stopped
+   alone would keep the others waiting.
+4. `must_stop` ends the loop.
+5. `finish` saves the state, waits until it is written, and raises `TrainingStopped` with the
+   command that resumes the run.
+
+A later Ctrl-C or SIGTERM does what it did before the training: in a command, it ends the process at
+once (`StopRequest`). What was saved before it stays.
+
 An exception in a callback takes the way of a first signal, and is raised at its end; the callback
 is called no more.
 
@@ -22,6 +29,9 @@ is called no more.
 | before there is anything to save | raises `Interrupted`; a new folder is removed | 130 |
 | later | saves what is new, raises `TrainingStopped` | 0 |
 | while the report is drawn | leaves it out, raises `TrainingStopped` (`run.leave_report`) | 0 |
+
+In a resumed run, "later" begins once it is compiled, also where nothing is new yet. It lasts
+through the last save, until the callbacks are closed (`train`).
 """
 
 import concurrent.futures
@@ -44,12 +54,13 @@ from bounce_mjx.errors import UserError
 from bounce_mjx.evaluation.results import Report
 from bounce_mjx.interrupt import Interrupted, StopRequest
 from bounce_mjx.learning.policy import Policy
+from bounce_mjx.learning.ppo import PPO
 from bounce_mjx.learning.registry import find_algorithm
 from bounce_mjx.physics.convergence import solver_warning
 from bounce_mjx.resources import VERSION
 from bounce_mjx.runs import checkpoints, creation, folders
 from bounce_mjx.runs.config import TrainConfig, import_flags_of_run
-from bounce_mjx.runs.progress import PATIENCE, Progress, waits_are_over
+from bounce_mjx.runs.progress import PATIENCE, Progress, all_may_end
 from bounce_mjx.runs.storage import lock_run, writable
 from bounce_mjx.training import events, faults, hosts
 from bounce_mjx.training.clock import Clock
@@ -68,7 +79,7 @@ _SLOW_MODULES = "orbax.checkpoint", "bounce_mjx.reports.page"
 
 
 class TrainingStopped(Interrupted):
-    """The user stopped the training; the text says how to continue."""
+    """The user stopped the training, or the report that follows it; the text says how to go on."""
 
 
 def train(
@@ -109,11 +120,14 @@ def train(
                     break
                 metrics, seconds = job.train_block()
                 job.tell_block(metrics, seconds)
-                job.end_diverged(metrics["fault"])
+                job.mark_diverged(metrics["fault"])
             job.finish()
         except jax.errors.JaxRuntimeError as error:
             raise UserError(job.describe_failure(error)) from error
-        return job.seeds
+    # One may have come while the callbacks were closed. No process waits for another any more.
+    if job.stop.requested:
+        raise job.stopped(job.at_the_end)
+    return job.seeds
 
 
 def open_job(
@@ -135,7 +149,7 @@ def open_job(
     total_steps = config.in_whole_blocks(config.total_steps)
     config = config.model_copy(update={"total_steps": total_steps})
     env = Env(config.env)
-    trainer = make_trainer(config, env)
+    trainer = trainer_of(config, env)
     is_warm = config.warm_start is not None and resume is None
     networks = checkpoints.read_warm_start(config, env) if is_warm else None
     # Until here, a signal does what it does without a training: in a command, it ends the process.
@@ -166,15 +180,23 @@ def open_job(
     return job
 
 
-def make_trainer(config: TrainConfig, env: Env) -> Trainer:
-    """What trains with the algorithm of a config (`learning.algorithm.Algorithm`): its own trainer,
-    or `PPOTrainer` where it returns None. `PPO` does, as `learning` may not import `training`.
+def trainer_of(config: TrainConfig, env: Env) -> Trainer:
+    """What trains with the algorithm of a config: what its `make_trainer` returns, or `PPOTrainer`
+    where that is None: only `PPO` and its subclasses may, as `learning` may not import `training`.
 
     Raises:
-      UserError: the config does not fit it.
+      UserError: the config does not fit it, or another algorithm has returned None.
     """
-    own_trainer = find_algorithm(config.algorithm).make_trainer(config, env)
-    return PPOTrainer(config, env) if own_trainer is None else own_trainer
+    algorithm = find_algorithm(config.algorithm)
+    own_trainer = algorithm.make_trainer(config, env)
+    if own_trainer is not None:
+        return own_trainer
+    if not issubclass(algorithm, PPO):
+        raise UserError(
+            f"make_trainer of the algorithm {algorithm.__name__} has returned None; return a "
+            "bounce_mjx.training.trainer.Trainer, or extend PPO"
+        )
+    return PPOTrainer(config, env)
 
 
 @dataclasses.dataclass
@@ -459,34 +481,30 @@ class Job:
           UserError: the state could not be saved.
           BaseException: what a callback raised.
         """
-        was_stopped = self.must_stop()
+        stops_early = self.must_stop()
         # The policy of a warm start is saved once it is evaluated.
         has_nothing = self.is_new and self.steps == 0 and not self.is_evaluated()
-        if was_stopped and has_nothing:
+        if stops_early and has_nothing:
             jax.distributed.shutdown()
             raise self.failure or Interrupted
-        if not was_stopped:
+        if not stops_early:
             self.say(self.why_it_ends())
         if self.needs_save:
             self.save()
-        self.end_last_save("the end of the training is lost")
+        self.end_save("the end of the training is lost")
         where = ""
-        if not was_stopped:
+        if not stops_early:
             is_measured = self.evaluate_best()
-            where = ", before the final evaluation"
-            if is_measured:
-                where = f", at the end of the training; the results are in {self.run}"
+            where = self.at_the_end if is_measured else ", before the final evaluation"
         # A signal may have come during the last save, too.
-        must_stop = self.must_stop()
+        stops_late = self.must_stop()
         # Every process waits here for the others; after this, none needs another.
         jax.distributed.shutdown()
         if self.failure is not None:
             self.say(f"a callback failed after {self.steps:,} steps; {self.continuing}")
             raise self.failure
-        if must_stop:
-            raise TrainingStopped(
-                f"stopped after {self.steps:,} steps{where}; {self.continuing}{self.report_so_far}"
-            )
+        if stops_late:
+            raise self.stopped(where)
 
     def evaluate_best(self) -> bool:
         """Evaluates the best policies on fresh resets, and writes the results; returns False if a
@@ -502,11 +520,11 @@ class Job:
             # For results.json and what is printed; the checkpoint has the report that chose it.
             seed.progress.best = report if seed.best else None
         self.saver.start(None, self.steps, self.about(fresh_resets=True))
-        self.end_last_save("the final results are not saved")
+        self.end_save("the final results are not saved")
         return True
 
-    def end_last_save(self, loss: str) -> None:
-        """Waits for a save that no other follows.
+    def end_save(self, loss: str) -> None:
+        """Waits for the save, whose failure ends the training with a sentence.
 
         Args:
           loss: what is lost if it failed.
@@ -544,8 +562,8 @@ class Job:
 
     def ends_by_results(self) -> bool:
         """Whether the results end the training (`stop_when_solved`)."""
-        are_over = waits_are_over([seed.progress for seed in self.seeds])
-        return self.config.stop_when_solved and are_over
+        may_end = all_may_end([seed.progress for seed in self.seeds])
+        return self.config.stop_when_solved and may_end
 
     def why_it_ends(self) -> str:
         """Why the training ends here, in words."""
@@ -606,7 +624,7 @@ class Job:
                     continue
                 try:
                     answer = callback(event)
-                # Raised once the others know the event, and the state is saved (`finish`).
+                # Raised once the other processes know of it (`must_stop`), and the state is saved.
                 except BaseException as failure:  # noqa: BLE001
                     self.failure = self.failure or failure
                     self.failed_callbacks.append(callback)
@@ -615,6 +633,21 @@ class Job:
                 if isinstance(answer, bool | np.bool_) and not answer:
                     self.ended_by_callback = True
         self.ended_by_callback = hosts.any_of(self.ended_by_callback)
+
+    def stopped(self, where: str) -> TrainingStopped:
+        """What is raised where a signal has stopped the training.
+
+        Args:
+          where: at which point, as a part of the sentence.
+        """
+        return TrainingStopped(
+            f"stopped after {self.steps:,} steps{where}; {self.continuing}{self.report_so_far}"
+        )
+
+    @property
+    def at_the_end(self) -> str:
+        """Where a signal has stopped a training whose results are written (`stopped`)."""
+        return f", at the end of the training; the results are in {self.run}"
 
     @property
     def continuing(self) -> str:
@@ -666,8 +699,8 @@ class Job:
         self.clock.lap("evaluate")
         return reports
 
-    def end_diverged(self, block_faults: np.ndarray) -> None:
-        """Ends a run that diverged; with several seeds, the other seeds continue.
+    def mark_diverged(self, block_faults: np.ndarray) -> None:
+        """Marks the seeds that diverged in the last block; the others continue.
 
         Args:
           block_faults: the metric "fault" of the last block [S, I].
@@ -682,7 +715,8 @@ class Job:
             if len(self.seeds) > 1:
                 self.say(f"seed {seed.config.seed} diverged: {seed.progress.fault}")
         if diverged:
-            # The results of the other seeds may now end the training: those that are saved.
+            # Without these seeds, the results of the others may end the training (`ends_here`), and
+            # results count once they are saved.
             self.saver.collect()
         if not self.healthy():
             raise UserError(

@@ -19,7 +19,7 @@ from bounce_mjx.config.command_line import stdout
 from bounce_mjx.config.validation import validate
 from bounce_mjx.deploy.environments import environment
 from bounce_mjx.deploy.interface import check_interface, interface_of
-from bounce_mjx.deploy.wrappers import environments_in, in_library
+from bounce_mjx.deploy.wrappers import environments_in, for_any_arrays
 from bounce_mjx.env.env import Env
 from bounce_mjx.errors import UserError, reason_of, shorten
 from bounce_mjx.evaluation.config import EvaluationOptions
@@ -135,7 +135,7 @@ class Run:
         advice = f"make the environment with policy={name!r}, or take Run({name!r}).env()"
         for found in environments_in(env):
             check_interface(interface_of(config), interface_of(found.config), name, advice)
-        return in_library(jax.jit(self.policy), config.layout.size)
+        return for_any_arrays(jax.jit(self.policy), config.layout.size)
 
     def evaluate(self, **options: Any) -> Report:
         """Measures the results of the best checkpoint, as `bounce-mjx eval` does.
@@ -201,7 +201,7 @@ def train(
 
     Raises:
       UserError: a setting is wrong; or as `job.train`.
-      TrainingStopped: the user stopped the training.
+      TrainingStopped: the user stopped the training, or the report.
     """
     for name in ("task", "resume"):
         if name in settings:

@@ -198,8 +198,8 @@ class WorldSettings(settings.StrictModel):
 
 
 class WorldConfig(WorldSettings):
-    """The world of an environment: the robot, the ball, the time steps, the resets, the sensors
-    and the randomisation. The config of a task extends it."""
+    """The settings of an environment, of which a world is a part: robot, ball, time steps, resets,
+    sensors and randomisation. The config of a task extends it."""
 
     task: ClassVar[Any] = None
     """The class of the task that these settings are of (`task.Task`)."""

@@ -337,7 +337,7 @@ def make_env(
     """What `gymnasium.make` calls: a `TaskEnv` of an `environment`.
 
     Args:
-      task: the start of the environment.
+      task: a task, a policy, a run or a config (`EnvironmentOf`).
       settings: its other arguments, such as policy="robust", world="fast_servo" or
         episode_seconds=30.
     """

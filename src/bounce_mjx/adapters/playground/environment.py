@@ -40,7 +40,7 @@ def default_config(task: EnvironmentOf | None = None, **settings: Any) -> config
     """The settings of an environment, some under Playground's own names.
 
     Args:
-      task: the start of the environment.
+      task: a task, a policy, a run or a config (`EnvironmentOf`).
       settings: the other arguments of `environment`.
     """
     return config_of(environment_config(task, **settings))
@@ -194,7 +194,8 @@ def make_env(
       config: must be the one of the task or the policy (`default_config`), whose values it may
         change; None for that.
       config_overrides: values on top, by dotted key.
-      task: the start of the environment; policy and world are as in `environment`.
+      task: a task, a policy, a run or a config (`EnvironmentOf`).
+      policy, world: as in `environment`.
 
     Raises:
       UserError: a setting is wrong, or the policy's environment has another value.
