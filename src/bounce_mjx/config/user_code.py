@@ -1,6 +1,6 @@
 """The user's own code: imported once, by `--import` or as any module, its classes have names.
 
-In names of the package, `own` is the user's, as in `own_name` and `own_algorithm`.
+In the names of functions, here and where these are called, `own` is the user's (`own_algorithm`).
 
 The name of a class is its class name in lower case, such as dribble of `class Dribble(Task)`; a
 task of an installed package has that of its entry point (`task/registry.py`). Nothing else ever
