@@ -91,7 +91,7 @@ def seeds_table(reports: dict[int, Report | None]) -> Table:
     for header in ("seed", *(result.name for result in known[0].results), "all met"):
         text = escape(header.replace(" ", "\n"))
         columns.append(Column(text, justify="right"))
-    table = plain_table("best checkpoint of each seed, on fresh resets", *columns)
+    table = plain_table("best checkpoint of each seed", *columns)
     for seed, report in reports.items():
         if report is None:
             table.add_row(str(seed), "diverged")
