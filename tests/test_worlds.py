@@ -288,6 +288,17 @@ class _Moving(Bounce):
         randomization: RandomizationConfig = RandomizationConfig(goal_interval=(3.0, 3.0))
 
 
+def test_the_nominal_world_of_a_task_is_that_of_its_policies() -> None:
+    """Of balance, whose defaults push the ball, there are no pushes."""
+    balance = find_task("balance")
+    pushed = settings_in_world(balance, "own")
+    nominal = settings_in_world(balance, "nominal")
+    assert pushed.randomization.push_interval is not None
+    assert nominal.randomization.push_interval is None
+    assert nominal == settings_in_world(pushed, "nominal")
+    assert environment_config("balance", "nominal") == nominal
+
+
 def test_how_often_a_task_samples_its_goals_is_no_part_of_a_world() -> None:
     """Whatever replaces the world of its training."""
     trained = _Moving.Config(randomization={"goal_interval": (3.0, 3.0), "air_drag": (0.0, 0.1)})

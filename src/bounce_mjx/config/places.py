@@ -37,7 +37,7 @@ def _place(file: str, line: int) -> str:
     """A line of a user's file in words; empty for a file of an installed package."""
     path = Path(file)
     is_installed = {"site-packages", "dist-packages"} & {*path.parts}
-    is_own = path.is_relative_to(Path(__file__).parent.parent)
-    if is_installed or is_own or not path.suffix:
+    is_of_package = path.is_relative_to(Path(__file__).parent.parent)
+    if is_installed or is_of_package or not path.suffix:
         return ""
     return f" ({path.name}, line {line})"

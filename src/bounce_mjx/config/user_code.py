@@ -39,7 +39,8 @@ class CodeFile(NamedTuple):
 
     path: Path
     content: bytes
-    """What was imported, which may have been edited since."""
+    """What was imported, which may have been edited since; of a module that Python imported itself,
+    what its file holds now."""
 
 
 # Of the imported files, by the name of their module.

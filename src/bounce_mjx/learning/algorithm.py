@@ -18,7 +18,8 @@ class Algorithm:
     Config: ClassVar[type[PPOConfig]] = PPOConfig
     """Type of the settings, which are the group `ppo` of the training's config whatever the
     algorithm: those of PPO, as they describe the network of every policy and the presets have them,
-    and more. Its `batch_steps` are the environment steps of an iteration."""
+    and more. Its property `batch_steps` is the environment steps of an iteration, of PPO `num_envs`
+    times `rollout_length`; an algorithm with others overrides it."""
 
     @classmethod
     def make_trainer(cls, config: Any, env: Any) -> Any:
@@ -27,7 +28,8 @@ class Algorithm:
 
         Args:
           config: of the run, a `runs.config.TrainConfig`; its `ppo` is of this class's `Config`.
-          env: one environment, an `env.env.Env`, of which the trainer steps as many as it likes.
+          env: one environment, an `env.env.Env`, of which the trainer steps as many as it likes
+            (`env/vector.py`).
 
         Raises:
           UserError: the class has none, or the config does not fit.

@@ -1,8 +1,7 @@
 """The settings of the environment of a task, or of a policy's training, in a world:
-`settings_in_world`. It is called by `deploy.environments`, which makes the `Env` of Python and of
-the adapters, and by `WhichPolicy.config_of`, for `eval`, `play` and `robustness`. What acts with a
-policy where it was trained, such as `export`, takes the settings of its run as they are
-(`load_run_config`).
+`settings_in_world`. Whoever names a world asks it: `deploy.environments`, which makes the `Env` of
+Python and of the adapters, and the commands. What acts with a policy where it was trained, such as
+`export`, takes the settings of its run as they are (`load_run_config`).
 
 They are layers (`Layer`), the lowest first: what the policy was trained in, its robot, and
 its world (`layers_of_environment`). A training has further layers between them (`runs/layers.py`).
@@ -28,7 +27,7 @@ from bounce_mjx.world.randomization import RandomizationConfig
 
 OWN = "own"
 """World: the own one, as it is: of a policy, each that its training sampled; of a task, that of its
-defaults."""
+defaults, such as the pushes of balance."""
 TRAINING = "training"
 """World: each that a policy's training sampled, without its curriculum."""
 NOMINAL = "nominal"
@@ -89,7 +88,8 @@ def settings_in_world(
                 f"the world {TRAINING} is that of a policy; give a policy, or a named world"
             )
         named = None if world in (OWN, NOMINAL) else Path(world)
-        return _merged(task.Config, layers_of_environment(task, None, robot, named))
+        config = _merged(task.Config, layers_of_environment(task, None, robot, named))
+        return config.in_world(RandomizationConfig()) if world == NOMINAL else config
     config = task_or_config
     _check_one_robot(config, robot)
     if world == OWN:

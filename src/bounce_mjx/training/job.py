@@ -716,7 +716,7 @@ class Job:
                 self.say(f"seed {seed.config.seed} diverged: {seed.progress.fault}")
         if diverged:
             # Without these seeds, the results of the others may end the training (`ends_here`), and
-            # results count once they are saved.
+            # those that a failed save has set back no longer count.
             self.saver.collect()
         if not self.healthy():
             raise UserError(

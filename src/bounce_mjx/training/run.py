@@ -178,14 +178,15 @@ def train(
         print(run.results.summary)
 
     In the main thread, a first Ctrl-C saves the state and raises `TrainingStopped`, a
-    KeyboardInterrupt. Compiled programs are kept in the user's cache folder. On a CPU, JAX starts
-    with an option that halves compilation; MJX needs a process of its own then.
+    KeyboardInterrupt; before there is anything to save, it raises `Interrupted`, another one.
+    Compiled programs are kept in the user's cache folder. On a CPU, JAX starts with an option that
+    halves compilation; MJX needs a process of its own then.
 
     Args:
       start: the first word of the command: the name or the class of a task; a policy of the
         package, from whose networks and environment the training starts; or a run's folder or a
-        checkpoint in it, to continue in place, of which only the length and the evaluations may
-        change.
+        checkpoint in it, to continue in place, of which only the length, the evaluations and the
+        saves may change (`runs.config.RESUMABLE_KEYS`).
       config: name of a preset or a YAML file, or several, each of which lies on those before it; by
         default, the preset for this machine. Or a whole config, which stands alone.
       robot: name or file of a robot's config.

@@ -30,7 +30,7 @@ class Trainer(Protocol):
     """S independent runs of one algorithm, one for each seed. Their policies are
     `learning.policy.Policy`, with parameters as `make_networks(ppo, ...).policy_network.init` gives
     them: evaluations and every command act with the network that the config's `ppo` describes.
-    `adapters.torch.policy.to_policy` makes such a policy of PyTorch's layers.
+    `adapters.torch.policy.to_policy(...).policy` is one of PyTorch's layers.
 
     The job asks the algorithm for one (`learning.algorithm.Algorithm.make_trainer`). Then it calls
     `compile` and `start`, once each, and `train_block` for each block. It may ask for
