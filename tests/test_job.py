@@ -593,6 +593,24 @@ def test_a_signal_during_the_last_save_is_not_lost(tmp_path: Path, monkeypatch) 
     assert results_of(run)["fresh_resets"]
 
 
+def test_a_signal_during_the_final_evaluation_leaves_it_out(tmp_path: Path) -> None:
+    ended = threading.Event()
+
+    class Waiting(Scores):
+        def final(self, policies) -> list[Report]:
+            os.kill(os.getpid(), signal.SIGTERM)
+            ended.wait()
+            return super().final(policies)
+
+    try:
+        with pytest.raises(job.TrainingStopped, match="128 steps, before the final evaluation; "):
+            train(tmp_path, {1: 5.0, 2: 9.0}, scores=Waiting)
+    finally:
+        ended.set()
+    (run,) = tmp_path.iterdir()
+    assert not results_of(run)["fresh_resets"]
+
+
 def test_a_signal_while_the_callbacks_are_closed_is_not_lost(tmp_path: Path) -> None:
     class Closing:
         def __call__(self, event) -> None:
