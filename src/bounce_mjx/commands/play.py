@@ -135,10 +135,12 @@ def film_command(
     switches: set[str] = set()
     with_value: set[str] = set()
     for key, flag in flag_names(fields).items():
-        if flag not in known:
-            is_switch = fields[key].annotation is bool
-            (switches if is_switch else with_value).add(flag)
-    switches |= {negated(flag) for flag in switches}
+        if flag in known:
+            continue
+        if fields[key].annotation is bool:
+            switches |= {flag, negated(flag)}
+        else:
+            with_value.add(flag)
     kept = []
     words = iter(plain_words(args))
     for word in words:

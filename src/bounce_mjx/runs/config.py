@@ -356,15 +356,14 @@ def import_flags_of_run(run: Path, *, to_train: bool = False) -> list[str]:
       to_train: whether the command trains, for which it also needs the run's own algorithm;
         whatever acts with the policy needs the task alone.
     """
-    copies: list[Path] = []
-    for key in ("task", "algorithm") if to_train else ("task",):
+    keys = ["task", "algorithm"] if to_train else ["task"]
+    # One file may hold both, and is imported once.
+    copies: dict[bytes, Path] = {}
+    for key in keys:
         copy = copied_code(run, key)
-        is_new = copy is not None and all(
-            copy.read_bytes() != other.read_bytes() for other in copies
-        )
-        if is_new:
-            copies.append(copy)
-    return import_flags(copies)
+        if copy is not None:
+            copies.setdefault(copy.read_bytes(), copy)
+    return import_flags(copies.values())
 
 
 def is_as_copied(kind: type, run: Path, key: str) -> bool:

@@ -81,21 +81,20 @@ def settings_in_world(
       UserError: the robot or the world is missing or wrong, the world is of another robot, a policy
         or a term does not fit the arm, or a task has no training's worlds.
     """
+    if world == NOMINAL:
+        return settings_in_world(task_or_config, OWN, robot).in_world(RandomizationConfig())
     if not isinstance(task_or_config, WorldConfig):
         task = task_or_config
         if world == TRAINING:
             raise UserError(
                 f"the world {TRAINING} is that of a policy; give a policy, or a named world"
             )
-        named = None if world in (OWN, NOMINAL) else Path(world)
-        config = _merged(task.Config, layers_of_environment(task, None, robot, named))
-        return config.in_world(RandomizationConfig()) if world == NOMINAL else config
+        named = None if world == OWN else Path(world)
+        return _merged(task.Config, layers_of_environment(task, None, robot, named))
     config = task_or_config
     _check_one_robot(config, robot)
     if world == OWN:
         return config
-    if world == NOMINAL:
-        return config.in_world(RandomizationConfig())
     if world == TRAINING:
         ended = {"warmup_steps": 0, "first_goal_range": 1.0}
         randomization = config.randomization.model_copy(update=ended)

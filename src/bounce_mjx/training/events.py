@@ -13,7 +13,6 @@ from bounce_mjx.evaluation.results import Report
 from bounce_mjx.learning.policy import Policy
 from bounce_mjx.reports.tables import count_text, result_text
 from bounce_mjx.runs.config import TrainConfig
-from bounce_mjx.task.task import Curve
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,9 +97,9 @@ def block_line(
     """
     rate = count_text(points[0]["speed/steps_per_second"])
     line = f"{count_text(steps)} steps  {rate} steps/s"
-    line += _curve_text(Curve("episode/return", ""), ".0f", points)
+    line += _point_text("episode/return", points, ".0f")
     for curve in config.env.task.curves:
-        line += _curve_text(curve, ".3g", points)
+        line += _point_text(curve.tag, points, ".3g", curve.scale, curve.unit)
     line += f"  block {seconds:.1f} s"
     if left:
         or_sooner = " or by its results" if config.stop_when_solved else ""
@@ -108,21 +107,27 @@ def block_line(
     return line
 
 
-def _curve_text(curve: Curve, form: str, points: list[dict[str, float]]) -> str:
-    """A curve's newest point in its unit, the mean over the seeds that have one, and their
-    standard deviation; empty if none has.
+def _point_text(
+    tag: str, points: list[dict[str, float]], form: str, scale: float = 1.0, unit: str = ""
+) -> str:
+    """A curve's newest point, the mean over the seeds that have one, and their standard deviation;
+    empty if none has.
 
     Args:
-      form: format of a number.
+      tag: of the curve.
       points: of each seed.
+      form: format of a number.
+      scale: factor to the unit.
+      unit: of the number as text; empty for none.
     """
-    values = [curve.scale * point[curve.tag] for point in points if curve.tag in point]
+    values = [scale * point[tag] for point in points if tag in point]
     if not values:
         return ""
-    name = curve.tag.rpartition("/")[2].replace("_", " ")
-    spread = f" +- {np.std(values):{form}}" if len(values) > 1 else ""
-    unit = f" {curve.unit}" if curve.unit else ""
-    return f"  {name} {np.mean(values):{form}}{spread}{unit}"
+    name = tag.rpartition("/")[2].replace("_", " ")
+    text = f"  {name} {np.mean(values):{form}}"
+    if len(values) > 1:
+        text += f" +- {np.std(values):{form}}"
+    return f"{text} {unit}" if unit else text
 
 
 def evaluation_line(config: TrainConfig, steps: int, reports: Sequence[Report]) -> str:
